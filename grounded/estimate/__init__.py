@@ -1,36 +1,34 @@
-"""State estimation: filter, smoother, likelihood and noise.
+"""State estimation: filter, smoother and noise of stored trials.
 
     smooth_trials   the smoother, or the extended Kalman filter alone, along stored trials
     noise_of        process and measurement noise by maximum likelihood
 
-All of it works for any model (including black-box simulators), lost
-samples, sensors and controllers of different rates, and transport delays of any fraction of a step.
-
-Read `trials` first (the public functions), then `measurement` and `record` (their input),
-`extended` (the Kalman filter along a track) with `steps` (the model in it), `likelihood` (the
-noise). The linear filter is in `grounded.filter`.
+All of it works for any model (including black-box simulators), lost samples, controllers of another
+rate than the sensors, and transport delays of any fraction of a step. Read `smoother`; `record`
+holds its input. The linear filter is in `grounded.filter`.
 """
 
 from __future__ import annotations
 
-from grounded.estimate.likelihood import NoiseEstimate
-from grounded.estimate.measurement import Measurement, NoiseStd, of_states
-from grounded.estimate.record import Record, cut, record_of
-from grounded.estimate.trials import (
+from grounded.estimate.record import Record, cut, part, record_of
+from grounded.estimate.smoother import (
     Estimated,
+    NoiseEstimate,
+    NoiseStd,
+    first_noise,
     noise_of,
     smooth_trials,
 )
 
 __all__ = [
     "Estimated",
-    "Measurement",
     "NoiseEstimate",
     "NoiseStd",
     "Record",
     "cut",
+    "first_noise",
     "noise_of",
-    "of_states",
+    "part",
     "record_of",
     "smooth_trials",
 ]

@@ -1,11 +1,12 @@
-"""Record: measurements and commands of a run, each with its own times; and batches of records.
+"""Record: measured states and commands of a run, each with its own times; and batches of records.
 
-    y_i = H x(t_i) + v_i,          u_j(t) = command_j(t - latency_j)
+    y_i = x(t_i) + v_i,          u_j(t) = command_j(t - latency_j)
 
 A record may combine a camera at 30 Hz and a controller at 20 Hz: states are estimated at the
 instants `times`, and the input over [t_i, t_i+1] is the mean of the held commands over
 [t_i - latency, t_i+1 - latency]. On a common grid this equals the delay queue of
-`grounded.compile.problem`, including fractions of a step. A lost sample is NaN.
+`grounded.compile.problem`, including fractions of a step. A lost sample is NaN, and so is a state
+that nothing measures.
 
 A filter is a recursion over time; it is fast if it runs over all trials at once. So records are
 combined to a `RecordBatch`: time first, then trial, padded to the longest. Padding and lost samples
@@ -16,35 +17,32 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from grounded.checks import known, list_of, of_shape, refused, same_names, wrong
-from grounded.estimate.measurement import Measurement
 from grounded.frozen import Array, readonly
 from grounded.model import Model
 from grounded.trial import Trial
 
+START_STD = 1.0  # prior standard deviation of an unmeasured first state, in its unit
+
 
 @dataclass(frozen=True, eq=False)
 class Record:
-    """One run with ny measured channels, m inputs and n states.
+    """One run with n states and m inputs.
 
     Args:
-        times: instants at which states are estimated, ascending [s], (T + 1,).
-        measured: measurements y, NaN where nothing was measured, (T + 1, ny).
+        times: instants at which states are estimated, evenly spaced [s], (T + 1,).
+        measured: measured states, NaN where nothing was measured, (T + 1, n).
         command_times: times at which commands were sent, ascending [s], (M,).
         commands: commands, each held from its time on, (M, m).
         past: command held before the first one, (m,); None for zero.
-        start: prior mean of the first state, used for states that no channel measures, (n,); or of
-            the state at each time, (T + 1, n), so that parts of the record have one too; None for
+        start: prior mean of the first state, used for states without a measurement, (n,); None for
             zero.
-        start_std: prior standard deviation of the first state, (n,), or of the state at each time,
-            (T + 1, n); None for 1 in each unit.
-        id: id of the trial it came from.
+        start_std: prior standard deviation of the first state, (n,); None for 1 in each unit.
 
     Raises:
         GroundedError: if the shapes do not match or times do not ascend.
@@ -57,7 +55,6 @@ class Record:
     past: Array | None = None
     start: Array | None = None
     start_std: Array | None = None
-    id: str = ""
 
     def __post_init__(self) -> None:
         for name in ("times", "measured", "command_times", "commands"):
@@ -109,9 +106,7 @@ def _held(commands: Array, past: Array) -> Array:
 
 
 def record_of(model: Model, trial: Trial) -> Record:
-    """Convert a trial to a record that measures the model's states.
-
-    States are matched by name; states that the trial lacks are NaN, that is, not measured.
+    """Convert a trial to a record of the model's states, matched by name; NaN where it lacks one.
 
     Raises:
         GroundedError: if the trial lacks an input of the model or has none of its states.
@@ -128,14 +123,8 @@ def record_of(model: Model, trial: Trial) -> Record:
     order = [trial.input_names.index(name) for name in model.input_names]
     times = np.arange(len(trial.states), dtype=float) * trial.dt
     past = None if trial.start_inputs is None else trial.start_inputs[order]
-    return Record(
-        times=times,
-        measured=measured,
-        command_times=times[: max(trial.steps, 1)],
-        commands=trial.inputs[:, order] if trial.steps else np.zeros((1, model.m)),
-        past=past,
-        id=trial.id,
-    )
+    sent = trial.inputs[:, order] if trial.steps else np.zeros((1, model.m))
+    return Record(times, measured, times[: max(trial.steps, 1)], sent, past)
 
 
 def cut(record: Record, seconds: float) -> list[Record]:
@@ -152,17 +141,7 @@ def cut(record: Record, seconds: float) -> list[Record]:
 def part(record: Record, first: int, last: int) -> Record:
     """Return rows first .. last of a record with all commands (latency needs earlier ones)."""
     rows = slice(first, last + 1)
-    start, std = record.start, record.start_std
-    if std is not None and std.ndim == 2:
-        std = std[rows]
-    elif first > 0 and start is not None and start.ndim == 1:
-        std = None  # it was that of a start that is not this part's
-    if start is not None and start.ndim == 2:
-        start = start[rows]
-    elif first > 0:
-        start = None
-    times, measured = record.times[rows], record.measured[rows]
-    return replace(record, times=times, measured=measured, start=start, start_std=std)
+    return replace(record, times=record.times[rows], measured=record.measured[rows])
 
 
 def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
@@ -178,93 +157,55 @@ def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
         raise refused("search.no_trial")
     for record in records:
         of_shape("commands of a record", record.commands, (len(record.commands), model.m))
+        of_shape("measured states", record.measured, (len(record.measured), model.n))
     return records
-
-
-START_STD = 1.0  # prior standard deviation of an unmeasured first state, in its unit
 
 
 @dataclass(frozen=True, eq=False)
 class RecordBatch:
-    """B records of at most T steps; n states, m inputs, ny channels."""
+    """B records of at most T steps of dt; n states, m inputs."""
 
-    y: Array  # (T + 1, B, ny), zero where not seen
-    seen: NDArray[np.bool_]  # (T + 1, B, ny)
+    dt: float  # [s]
+    y: Array  # (T + 1, B, n), zero where not seen
+    seen: Any  # (T + 1, B, n) of bool
     u: Array  # (T, B, m) inputs as received
-    dt: Array  # (T, B) [s]
-    valid: NDArray[np.bool_]  # (T, B)
-    lengths: NDArray[np.int64]  # (B,) steps of each record
+    valid: Any  # (T, B) of bool
     start: Array  # (B, n) mean of the first state
     start_var: Array  # (B, n) its variance, without the measurement noise
-    start_channel: NDArray[np.int64]  # (B, n) channel that measured the start; -1 for none
+    sampled: Any  # (B, n) of bool: the start is a sample, and has its noise
 
-    @cached_property
+    @property
     def count(self) -> int:
         """Number of samples in the likelihood."""
         return int(self.seen.sum())
 
-    @cached_property
-    def steps_of(self) -> tuple[tuple[float, NDArray[np.bool_] | None], ...]:
-        """Step sizes in use [s], each with a mask of its steps (T, B); None for all steps."""
-        sizes = np.unique(np.round(self.dt[self.valid], 9))
-        if len(sizes) == 1:
-            return ((float(sizes[0]), None),)
-        return tuple((float(h), np.abs(self.dt - h) < 1e-9) for h in sizes)
 
+def batch_of(records: Sequence[Record], latency: Array | None = None) -> RecordBatch:
+    """Combine records of one step size to a batch.
 
-def batch_of(
-    records: Sequence[Record], measurement: Measurement, n: int, latency: Array
-) -> RecordBatch:
-    """Combine records to a batch.
+    A measured state starts at its first sample, with that sample's noise; the sample is then not
+    used a second time. If it was measured only later, it may have changed by as much as it varies.
 
     Args:
         records: at least one record.
-        measurement: what `Record.measured` measures.
-        n: number of states.
-        latency: latency of each input [s], (m,).
-
-    Raises:
-        GroundedError: if a record has another number of channels than the measurement.
+        latency: latency of each input [s], (m,); None for zero.
     """
-    B, T, ny = len(records), max(r.steps for r in records), measurement.ny
-    m = records[0].commands.shape[1]
-    y, seen = np.zeros((T + 1, B, ny)), np.zeros((T + 1, B, ny), dtype=bool)
-    u, dt = np.zeros((T, B, m)), np.zeros((T, B))
-    starts = []
+    (_, n), m, B = records[0].measured.shape, records[0].commands.shape[1], len(records)
+    T, late = max(r.steps for r in records), np.zeros(m) if latency is None else latency
+    y, u = np.full((T + 1, B, n), np.nan), np.zeros((T, B, m))
+    start, var, sampled = np.zeros((B, n)), np.empty((B, n)), np.zeros((B, n), dtype=bool)
     for b, record in enumerate(records):
-        of_shape("measurements of a record", record.measured, (len(record.measured), ny))
-        t = record.steps
-        seen[: t + 1, b] = np.isfinite(record.measured)
-        y[: t + 1, b] = np.where(seen[: t + 1, b], record.measured, 0.0)
-        u[:t, b] = record.received(latency)
-        dt[:t, b] = np.diff(record.times)
-        starts.append(_start(record, measurement, n))
-        seen[0, b, starts[-1][2][starts[-1][2] >= 0]] = False
-    start, var, channel = (np.array(column) for column in zip(*starts, strict=True))
-    lengths = np.array([r.steps for r in records])
-    valid = np.arange(T)[:, None] < lengths
-    return RecordBatch(y, seen, u, dt, valid, lengths, start, var, channel)
-
-
-def _start(
-    record: Record, measurement: Measurement, n: int
-) -> tuple[Array, Array, NDArray[np.int64]]:
-    """Return mean (n,), variance without measurement noise (n,) and channel (n,) of the start.
-
-    A measured state starts at its first sample, with that sample's noise; the sample is then not
-    used a second time.
-    """
-    mean = np.zeros(n) if record.start is None else np.array(np.atleast_2d(record.start)[0])
-    std = np.full(n, START_STD) if record.start_std is None else record.start_std
-    given = np.array(np.atleast_2d(std)[0])
-    var, channel = given**2, np.full(n, -1)
-    for c, i in enumerate(measurement.states):
-        finite = np.flatnonzero(np.isfinite(record.measured[:, c]))
-        if len(finite) == 0:
-            continue
-        mean[i] = record.measured[finite[0], c]
-        if finite[0] == 0:
-            channel[i], var[i] = c, 0.0
-        else:  # measured only later: it may have changed by as much as it varies in this record
-            var[i] = max(float(np.var(record.measured[finite, c])), 1e-12)
-    return mean, var, channel
+        y[: record.steps + 1, b], u[: record.steps, b] = record.measured, record.received(late)
+        start[b] = 0.0 if record.start is None else record.start
+        var[b] = np.square(START_STD if record.start_std is None else record.start_std)
+        for i in range(n):
+            known_at = np.flatnonzero(np.isfinite(record.measured[:, i]))
+            if len(known_at):
+                start[b, i], sampled[b, i] = record.measured[known_at[0], i], known_at[0] == 0
+                spread = max(float(np.var(record.measured[known_at, i])), 1e-12)
+                var[b, i] = 0.0 if sampled[b, i] else spread
+    seen = np.isfinite(y)
+    seen[0] = False
+    valid = np.arange(T)[:, None] < np.array([r.steps for r in records])
+    dt = round(float(records[0].times[1] - records[0].times[0]), 9) if T else 1.0
+    return RecordBatch(dt, np.where(seen, y, 0.0), seen, u, valid, start, var, sampled)

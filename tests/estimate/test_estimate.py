@@ -13,19 +13,11 @@ from grounded.errors import GroundedError
 from grounded.estimate import (
     NoiseStd,
     noise_of,
-    of_states,
     record_of,
     smooth_trials,
 )
-from grounded.estimate.extended import (
-    filter_batch,
-    recursion,
-    relinked,
-    smooth,
-    variance_slopes,
-)
 from grounded.estimate.record import batch_of
-from grounded.estimate.steps import ModelSteps
+from grounded.estimate.smoother import filtered, relinked, variance_slopes
 from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
@@ -61,12 +53,6 @@ def simulated(model, rng, noise, *, B=4, T=100, latency=0.0, low=-1.0, high=1.0)
     y = x + noise.measurement * rng.standard_normal(x.shape)
     names = (model.state_names, model.input_names)
     return [x[:, b] for b in range(B)], [Trial(y[:, b], u[:, b], dt, *names) for b in range(B)]
-
-
-def batched(model, trials, latency=None):
-    measurement = of_states(model)
-    delay = np.zeros(model.m) if latency is None else latency
-    return batch_of([record_of(model, t) for t in trials], measurement, model.n, delay), measurement
 
 
 def dense(model, trial, noise):
@@ -108,10 +94,10 @@ def test_a_linear_model_is_filtered_and_smoothed_exactly():
 def test_a_state_that_nothing_measures_is_smoothed_halfway_up_its_disturbances():
     """Exactly, with its covariance: (x_t + f(x_t-1)) / 2 of the dense Gaussian."""
     _, trials = simulated(SPRING, np.random.default_rng(0), SPRING_NOISE, B=1, T=30)
-    trial, n, seen = trials[0], 2, of_states(SPRING, ["x"])
-    noise = NoiseStd(SPRING_NOISE.process, SPRING_NOISE.measurement[:1], DT)
+    trial, n, noise = trials[0], 2, SPRING_NOISE
     record = record_of(SPRING, trial)
-    record = replace(record, measured=trial.states[:, :1], start_std=SPRING_NOISE.measurement)
+    seen = np.where([True, False], trial.states, np.nan)
+    record = replace(record, measured=seen, start_std=SPRING_NOISE.measurement)
     start = np.array([trial.states[0, 0], 0.0])
     states = np.vstack([start, trial.states[1:]])
     at_start = Trial(states, trial.inputs, DT, SPRING.state_names, SPRING.input_names)
@@ -128,7 +114,7 @@ def test_a_state_that_nothing_measures_is_smoothed_halfway_up_its_disturbances()
         predicted = SPRING.system.step(np.zeros((1, n)), trial.inputs[t - 1 : t], SPRING.values, DT)
         offset[v] = 0.5 * predicted[0, 1]
 
-    found = smooth_trials(SPRING, [record], noise, measurement=seen)[0]
+    found = smooth_trials(SPRING, [record], noise)[0]
     assert np.allclose(found.states.ravel(), half @ after + offset, atol=1e-9)
     blocks = (half @ spread @ half.T).reshape(31, n, 31, n)
     expected = blocks[np.arange(31), :, np.arange(31)]
@@ -150,10 +136,9 @@ def test_slopes_by_the_variances_match_differences():
     lost = trials[1].states.copy()
     lost[5:8, 0], lost[3] = np.nan, np.nan
     gappy = Trial(lost, trials[1].inputs, DT, SPRING.state_names, SPRING.input_names)
-    batch, measurement = batched(SPRING, [trials[0], gappy, short])
-    base = filter_batch(
-        batch, measurement, SPRING_NOISE, ModelSteps(SPRING.system, SPRING.values, batch)
-    )
+    batch = batch_of([record_of(SPRING, one) for one in (trials[0], gappy, short)])
+    base = filtered(SPRING, batch, SPRING_NOISE)
+    assert relinked(base, batch, SPRING_NOISE)[-1] == pytest.approx(base.loglik)
 
     def at(theta):
         std = np.exp(theta / 2)
@@ -168,41 +153,6 @@ def test_slopes_by_the_variances_match_differences():
         assert slope[i] == pytest.approx(
             (at(theta + step)[-1] - at(theta - step)[-1]) / 2e-4, rel=1e-5
         )
-
-
-@pytest.mark.parametrize("width", [1, 3, 9])
-def test_the_compiled_pass_is_the_recursion(width):
-    rng = np.random.default_rng(20)
-    _, trials = simulated(car, rng, CAR_NOISE, B=width, T=60, latency=0.1)
-    lost = trials[0].states.copy()
-    lost[20:25, 2:], lost[30, :2] = np.nan, np.nan
-    names = (car.state_names, car.input_names)
-    trials[0] = Trial(lost, trials[0].inputs, DT, *names)
-    trials[-1] = Trial(trials[-1].states[:41], trials[-1].inputs[:40], DT, *names)
-    batch, measurement = batched(car, trials, np.array([0.1, 0.07]))
-    steps = ModelSteps(car.system, car.values, batch)
-    plain = recursion(batch, measurement, CAR_NOISE, steps.at)
-    near = NoiseStd(1.2 * CAR_NOISE.process, 0.9 * CAR_NOISE.measurement, DT)
-    fast = filter_batch(
-        batch, measurement, CAR_NOISE, steps, recursion(batch, measurement, near, steps.at)
-    )
-    assert fast.loglik == pytest.approx(plain.loglik, abs=1e-3)
-    pairs = [
-        (getattr(fast, name), getattr(plain, name)) for name in ("x", "x_prior", "e", "A", "eps")
-    ]
-    for name in ("P", "posterior", "k", "weight", "whitener"):
-        pairs.append((getattr(fast.gains, name), getattr(plain.gains, name)))
-    for a, b in pairs:
-        assert np.allclose(a, b, atol=1e-3 * np.abs(b).max())
-    one, two = smooth(fast), smooth(plain)
-    for name in ("x", "P"):
-        a, b = getattr(one, name), getattr(two, name)
-        assert np.allclose(a, b, atol=2e-3 * np.abs(b).max()), name
-    assert np.allclose(
-        *(variance_slopes(p.gains, p.eps, batch, CAR_NOISE) for p in (fast, plain)),
-        rtol=1e-2,
-        atol=0.1,
-    )
 
 
 def test_padding_and_lost_samples_change_nothing_of_the_others():

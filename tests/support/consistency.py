@@ -38,7 +38,7 @@ def consistency(
     """Compute the consistency of filtered trials. Args: estimated."""
     squares, count, products, pairs = 0.0, 0, 0.0, 0
     for trial in estimated:
-        eps = _whitened(trial)
+        eps = trial.innovations
         seen = np.isfinite(eps)
         squares, count = squares + float(np.nansum(eps**2)), count + int(seen.sum())
         both = seen[1:] & seen[:-1]
@@ -56,13 +56,6 @@ def consistency(
         nees=nees,
         nees_band=nees_band,
     )
-
-
-def _whitened(trial: Estimated) -> Array:
-    C = np.linalg.inv(np.linalg.cholesky(trial.innovation_covariance))
-    seen = np.isfinite(trial.innovations)
-    eps = (C @ np.where(seen, trial.innovations, 0.0)[..., None])[..., 0]
-    return np.where(seen, eps, np.nan)
 
 
 def _band(count: int) -> tuple[float, float]:

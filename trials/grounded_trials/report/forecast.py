@@ -12,10 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.estimate import NoiseStd, of_states
-from grounded.estimate.likelihood import first_noise
-from grounded.estimate.record import batch_of, records_of
-from grounded.estimate.trials import smooth_trials
+from grounded.estimate import NoiseStd, first_noise, record_of, smooth_trials
+from grounded.estimate.record import batch_of
 from grounded.frozen import Array
 from grounded.places import true_values
 from grounded.rollout import augmented
@@ -102,10 +100,10 @@ def _known(planner: Planner, trial: Trial) -> Trial:
         return lifted
     seen = np.where(np.arange(model.n) < n, lifted.states, np.nan)
     seen[0] = lifted.states[0]  # before the start they were settled
-    logged, measures = replace(lifted, states=seen), of_states(model)
+    logged = record_of(model, replace(lifted, states=seen))
     latency = planner.plan.latency
     assert latency is not None
-    noise = first_noise(batch_of(records_of(model, [logged]), measures, model.n, latency), measures)
+    noise = first_noise(batch_of([logged], latency))
     known = noise.measurement.copy()
     for memory, log in behind.items():
         known[memory] = known[log]

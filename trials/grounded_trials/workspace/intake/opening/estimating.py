@@ -23,7 +23,7 @@ import numpy as np
 
 from grounded.checks import refused
 from grounded.errors import GroundedError
-from grounded.estimate.record import Record
+from grounded.estimate.record import Record, cut, part
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -108,7 +108,7 @@ def with_estimates(
             found("file.steps", steps=0, dt=task.dt, every=every, start=0.0, stop=max(lasts, 0.0))
         )
     clock = _Clock.of(samples, min(int(s.t[0]) for s in (*samples, *sent)), task)
-    records = _records(samples, sent, clock, task.dt)
+    records = _records(samples, sent, clock, task)
     if not records:
         return dict(series)
     times, states = _smoothed(records, table, task, _sizes(samples, task))
@@ -169,17 +169,18 @@ def _makes(model: Model, step: float) -> bool:
 
 
 def _records(
-    samples: Sequence[Samples], sent: Sequence[Samples], clock: _Clock, dt: float
+    samples: Sequence[Samples], sent: Sequence[Samples], clock: _Clock, task: Task
 ) -> list[Record]:
     """Return the stretches of a log without long gaps, with every sample at the nearest row."""
     times: Array = np.arange(clock.rows, dtype=np.float64) * clock.step
-    measured, known = np.full((len(times), len(samples)), np.nan), np.ones(len(times), bool)
-    for column, s in zip(measured.T, samples, strict=True):
+    measured, known = np.full((len(times), task.model.n), np.nan), np.ones(len(times), bool)
+    own = [task.model.state_names.index(s.name) for s in samples]
+    for s, i in zip(samples, own, strict=True):
         t = (s.t - clock.origin) * 1e-9
         rows = np.unique(np.rint(t / clock.step).astype(int))
         rows = rows[(rows >= 0) & (rows < len(times))]
-        column[rows] = np.interp(times[rows], t, s.y)
-        for k in np.flatnonzero(np.diff(t) > s.max_gap(dt)):
+        measured[rows, i] = np.interp(times[rows], t, s.y)
+        for k in np.flatnonzero(np.diff(t) > s.max_gap(task.dt)):
             known &= (times <= t[k]) | (times >= t[k + 1])
     at = np.unique(np.concatenate([s.t for s in sent]))
     commands = np.column_stack(
@@ -190,7 +191,7 @@ def _records(
     return [
         Record(times[a:b], measured[a:b], command_times, commands, past)
         for a, b in zip(edges[::2], edges[1::2], strict=True)
-        if b - a >= FEWEST_ROWS and np.isfinite(measured[a:b]).any(axis=0).all()
+        if b - a >= FEWEST_ROWS and np.isfinite(measured[a:b, own]).any(axis=0).all()
     ]
 
 
@@ -225,63 +226,64 @@ def _smoothed(
     records: list[Record], table: EstimateTable, task: Task, sizes: Array
 ) -> tuple[Array, Array]:
     """Smooth records; return the times, (N,) [s], and the states, (N, n)."""
-    from grounded.estimate import NoiseStd, noise_of, of_states, smooth_trials
+    from grounded.estimate import NoiseStd, noise_of, smooth_trials
 
-    model, known = task.model, np.array(list(table.measured.values()))
-    measurement = of_states(model, list(table.measured))
-    options = {"latency": task.latency, "measurement": measurement}
+    model, late = task.model, task.latency
+    known = np.array([table.measured.get(name, 1.0) for name in model.state_names])
+    guessed = [name not in table.measured for name in model.state_names]
     records = [replace(record, start_std=START_SPREAD * sizes) for record in records]
 
     def fitted(records: list[Record]) -> NoiseStd:
-        found = noise_of(model, _moving(records), known=known, sizes=sizes, **options)  # type: ignore[arg-type]
+        found = noise_of(model, _moving(records), latency=late, known=known, sizes=sizes)
         process = np.array(found.noise.process)
         for name, std in table.process.items():
             process[model.state_names.index(name)] = std * np.sqrt(found.noise.dt / task.dt)
         return NoiseStd(process=process, measurement=known, dt=found.noise.dt)
 
     noise = fitted(records)
-    first = records[0]
-    if np.any(task.latency) and np.any(first.past != task.past):
-        std = np.tile(
-            START_SPREAD * sizes, (len(first.times), 1)
-        )  # of pieces of it that begin later
-        std[0, [name not in table.measured for name in model.state_names]] *= (
-            WAITING_SPREAD / START_SPREAD
-        )
-        held = replace(first, past=task.past)
-        rivals = [first, held, replace(held, start=task.start, start_std=std)]
-        begun = [next(_overlapping(one))[0] for one in rivals]
-        likely = [one.loglik for one in smooth_trials(model, begun, noise, **options)]  # type: ignore[arg-type]
-        if likeliest := int(np.argmax(np.nan_to_num(likely, nan=-np.inf))):
-            records = [rivals[likeliest], *(replace(one, past=task.past) for one in records[1:])]
-            noise = fitted(records)
     parts = [one for record in records for one in _overlapping(record)]
-    smooth = smooth_trials(model, [one for one, _ in parts], noise, **options)  # type: ignore[arg-type]
+    if np.any(late) and np.any(records[0].past != task.past):
+        # the log may begin with a run, which waited at its start
+        first, core = parts[0]
+        held = replace(first, past=task.past)
+        std = np.where(guessed, WAITING_SPREAD, START_SPREAD) * sizes
+        rivals = [first, held, replace(held, start=task.start, start_std=std)]
+        likely = [one.loglik for one in smooth_trials(model, rivals, noise, latency=late)]
+        if likeliest := int(np.argmax(np.nan_to_num(likely, nan=-np.inf))):
+            records = [replace(one, past=task.past) for one in records]
+            noise = fitted(records)
+            parts = [one for record in records for one in _overlapping(record)]
+            parts[0] = rivals[likeliest], core
+    smooth = smooth_trials(model, [one for one, _ in parts], noise, latency=late)
     kept = [one.states[core] for one, (_, core) in zip(smooth, parts, strict=True)]
     states = np.concatenate(kept)
     if not np.isfinite(states).all():
         raise refused("log.not_estimated", why=str(smooth[0].status))
-    return np.concatenate([one.times[core] for one, core in parts]), states
+    return np.concatenate(
+        [one.times[core] for one, (_, core) in zip(smooth, parts, strict=True)]
+    ), states
+
+
+def _complete(piece: Record, record: Record) -> bool:
+    """Return whether every state that is measured in a record is measured in a piece of it."""
+    seen, whole = (np.isfinite(one.measured).any(axis=0) for one in (piece, record))
+    return bool((seen == whole).all())
 
 
 def _overlapping(record: Record) -> Iterator[tuple[Record, slice]]:
     """Yield overlapping pieces of a record, each with the rows of it to keep."""
-    from grounded.estimate.record import part
-
     h = float(record.times[1] - record.times[0])
     each, more = max(PIECE, round(PIECE_S / h)), max(OVERLAP, round(OVERLAP_S / h))
     rows = len(record.times)
     for first in range(0, rows, each):
         a, b = max(0, first - more), min(rows, first + each + more)
         piece = part(record, a, b - 1)
-        if np.isfinite(piece.measured).any(axis=0).all():
+        if _complete(piece, record):
             yield piece, slice(first - a, min(first + each, rows) - a)
 
 
 def _moving(records: Sequence[Record]) -> list[Record]:
     """Return the parts of records in which commands change, in pieces; everything if none does."""
-    from grounded.estimate.record import cut, part
-
     sent = records[0]
     changed = sent.command_times[1:][(np.diff(sent.commands, axis=0) != 0).any(axis=1)]
     h = float(records[0].times[1] - records[0].times[0])
@@ -292,5 +294,5 @@ def _moving(records: Sequence[Record]) -> list[Record]:
         rows = np.flatnonzero((record.times >= first) & (record.times <= last))
         if len(rows) >= FEWEST_ROWS:
             found.append(part(record, int(rows[0]), int(rows[-1])))
-    pieces = [piece for record in found or records for piece in cut(record, span)]
-    return [piece for piece in pieces if np.isfinite(piece.measured).any(axis=0).all()]
+    whole = found or records
+    return [piece for record in whole for piece in cut(record, span) if _complete(piece, record)]
