@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 class LinearSystem(NamedTuple):
-    """What a filter is made of; H None: channel i measures state i."""
+    """What a filter is made of; channel i measures state i."""
 
     A: Array  # (L, B, N, N)
     Q: Array  # (L, B, N) variances
@@ -53,7 +53,6 @@ class LinearSystem(NamedTuple):
     seen: Array  # (L + 1, B, n) 1.0 where a measurement is there; row 0: where r[0] is the start
     start: Array  # (B, N) variances of the state at row 0
     G: Array | None = None  # (L, B, n, n) how the first n disturbances enter; None: as they are
-    H: Array | None = None  # (L, B, n, N) of rows 1 .. L; with H there is no G
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,16 +96,14 @@ class Gains:
         """The same of the first steps."""
         assert self.delayed is None
         rows = self.system._asdict() | {"seen": self.system.seen[: count + 1]}
-        rows |= {name: a[:count] for name, a in rows.items() if name in "AQHG" and a is not None}
+        rows |= {name: a[:count] for name, a in rows.items() if name in "AQG" and a is not None}
         rows["R"] = self.system.R[: count + 1]
         return Gains(LinearSystem(**rows), self.k[:count], self.weight[:count])
 
     @cached_property
     def measured(self) -> Array:
         """H, zero rows where a channel was not seen, (L, B, n, N)."""
-        n, N = self.k.shape[2:]
-        H = np.eye(n, N) if self.system.H is None else self.system.H
-        return np.asarray(H * self.system.seen[1:, ..., None])
+        return np.asarray(np.eye(*self.k.shape[2:]) * self.system.seen[1:, ..., None])
 
     @cached_property
     def whitener(self) -> Array:
@@ -144,7 +141,7 @@ def gains(
             "start": system.start,
             "G": system.G,
         }
-        values |= {"H": system.H, "R": system.R[1:], "seen": system.seen[1:]}
+        values |= {"R": system.R[1:], "seen": system.seen[1:]}
         kernels.run("gains", (n, N), values, {"k": k, "weight": weight, "P": P})
         if not np.isfinite(weight).all():
             raise np.linalg.LinAlgError("a covariance is not finite")
@@ -191,15 +188,15 @@ def updated(P: Array, H: Array, R: Array, seen: Array) -> tuple[Array, Array, Ar
 
 
 def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[Array, Array | None]:
-    """Filters columns: whitened innovations (L, B, n, C), and the filtered x (L + 1, B, m, C).
+    """Filters columns: whitened innovations (L, B, n, C), and the filtered x (L + 1, B, n, C).
 
-    Without H the first m = n states are disturbed and returned, with it all m = N.
+    Of the states, the first n are disturbed and returned.
 
     Args:
         g: the gains.
-        d: what each column adds to a step (L, B, m, C).
+        d: what each column adds to a step (L, B, n, C).
         r: what each column adds to a measurement (L + 1, B, n, C), or (L + 1, 1, 1, 1) of zeros;
-            without H, r[0] is where it begins. With H it begins at zero.
+            r[0] is where it begins.
         track: also return the filtered states.
     """
     if g.delayed is None:
@@ -210,20 +207,19 @@ def innovations(g: Gains, d: Array, r: Array, *, track: bool = False) -> tuple[A
 
 
 def _innovations(g: Gains, d: Array, r: Array, *, track: bool) -> tuple[Array, Array | None]:
-    (L, B, m, C), (n, N) = d.shape, g.k.shape[2:]
+    (L, B, n, C), N = d.shape, g.k.shape[3]
     compiled = kernels.available(n, N)
     wide = whole(C, n) if compiled else C
-    d, r = _widened(d, (L, B, m, wide)), _widened(r, (L + 1, B, n, wide))
+    d, r = _widened(d, (L, B, n, wide)), _widened(r, (L + 1, B, n, wide))
     out = np.empty((L, B, n, wide))
-    filtered = np.empty((L + 1, B, m, wide)) if track else None
+    filtered = np.empty((L + 1, B, n, wide)) if track else None
     x = np.zeros((B, N, wide))
-    if g.system.H is None:
-        x[:, :n] = r[0] * g.system.seen[0][..., None]
+    x[:, :n] = r[0] * g.system.seen[0][..., None]
     if filtered is not None:
-        filtered[0] = x[:, :m]
+        filtered[0] = x[:, :n]
     after = None if filtered is None else filtered[1:]
     if compiled:
-        values: dict[str, Any] = {"A": g.system.A, "H": g.system.H, "k": g.k, "weight": g.weight}
+        values: dict[str, Any] = {"A": g.system.A, "k": g.k, "weight": g.weight}
         values |= {"d": d, "r": r[1:], "x": x}
         kernels.run("innovations", (n, N), values, {"out": out, "track": after})
     else:
@@ -293,7 +289,7 @@ def _smoother(g: Gains, white: Array, covariances: bool) -> Adjoint:
         np.empty((L, B, N, N)) if covariances else None,
     )
     if kernels.available(n, N):
-        values: dict[str, Any] = {"A": g.system.A, "H": g.system.H, "G": G, "k": g.k}
+        values: dict[str, Any] = {"A": g.system.A, "G": G, "k": g.k}
         values |= {"weight": g.weight, "white": white}
         kernels.run("smoother", (n, N), values, vars(found))
         return found

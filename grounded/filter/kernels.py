@@ -25,9 +25,9 @@ LARGEST = 16  # channels; beyond, NumPy
 WIDEST = 48  # states
 _LOCK = threading.Lock()
 NAMES = {
-    "gains": ("A", "Q", "R", "seen", "start", "G", "H", "L", "B", "k", "weight", "P"),
-    "innovations": ("A", "H", "k", "weight", "d", "r", "x", "L", "B", "blocks", "out", "track"),
-    "smoother": ("A", "H", "G", "k", "weight", "white", "L", "B", "u", "D", "r", "N", "whole"),
+    "gains": ("A", "Q", "R", "seen", "start", "G", "L", "B", "k", "weight", "P"),
+    "innovations": ("A", "k", "weight", "d", "r", "x", "L", "B", "blocks", "out", "track"),
+    "smoother": ("A", "G", "k", "weight", "white", "L", "B", "u", "D", "r", "N", "whole"),
 }
 
 
@@ -68,29 +68,26 @@ def run(
     if name == "innovations":
         words["blocks"] = values["d"].shape[-1] // columns_together(sizes[0])
     if words["L"] and words["B"] and words.get("blocks", 1):
-        through, general = values.get("G") is not None, values["H"] is not None
-        call(_library(*sizes, through, general)[name], NAMES[name], words)
+        through = values.get("G") is not None
+        call(_library(*sizes, through)[name], NAMES[name], words)
 
 
-def _library(n: int, N: int, through: bool, general: bool) -> jit.Library:
+def _library(n: int, N: int, through: bool) -> jit.Library:
     """Made once, whatever thread asks first: of two, one would be freed while its code runs."""
     with _LOCK:
-        return _made(n, N, through, general)
+        return _made(n, N, through)
 
 
 @cache
-def _made(n: int, N: int, through: bool, general: bool) -> jit.Library:
+def _made(n: int, N: int, through: bool) -> jit.Library:
     lanes, columns = jit.lanes(), columns_together(n)
 
     def text() -> str:
         passes = {_Gains: lanes, _Innovations: columns, _Smoother: lanes}
-        parts = (
-            one(NAMES[one.name], n, N, width, through, general).text()
-            for one, width in passes.items()
-        )
+        parts = (one(NAMES[one.name], n, N, width, through).text() for one, width in passes.items())
         return declarations({lanes, columns}) + "".join(parts)
 
-    key = f"filter {_version()} {n} {N} {through} {general} {lanes} {columns}"
+    key = f"filter {_version()} {n} {N} {through} {lanes} {columns}"
     return jit.library(key, text, tuple(NAMES))
 
 
@@ -106,7 +103,7 @@ class _Gains(Pass):
 
     def write(self) -> None:
         f, n, N = self.f, self.n, self.N
-        rooms = {"A": N * N, "H": n * N, "G": n * n, "Q": N, "R": n, "seen": n}
+        rooms = {"A": N * N, "G": n * n, "Q": N, "R": n, "seen": n}
         room = {name: self.room(size) for name, size in rooms.items()}
         P, spare, k, weight = (self.room(size) for size in (N * N, N * N, n * N, n))
         for _ in self.groups():
@@ -116,7 +113,7 @@ class _Gains(Pass):
                 self.store(self.load(spare, i), P, i * N + i)
             with f.loop(self.L) as t:
                 for name, size in rooms.items():
-                    if (name != "H" or self.general) and (name != "G" or self.through):
+                    if name != "G" or self.through:
                         self.gather(name, t, size, room[name])
                 self.sandwich(room["A"], P, spare, transposed=False)
                 if self.through:
@@ -143,16 +140,9 @@ class _Gains(Pass):
 
     def _channel(self, c: str, P: str, room: Mapping[str, str], k: str, weight: str) -> None:
         f, N, W = self.f, self.N, self.W
-        _, h = self.channel(room["H"], c)
         row = self.at(k, c, N)
-        if h:
-            with f.loop(N) as line:
-                self.store(self.dot(self.all(self.at(P, line, N), N), h), self.at(row, line))
-            b = self.all(row, N)
-            s = self.dot(h, b, self.load(self.at(room["R"], c)))
-        else:
-            b = self.all(self.at(P, c, N), N)  # symmetric: the row is the column
-            s = f.add(self.load(self.at(self.at(P, c, N), c)), self.load(self.at(room["R"], c)), W)
+        b = self.all(self.at(P, c, N), N)  # symmetric: the row is the column
+        s = f.add(self.load(self.at(self.at(P, c, N), c)), self.load(self.at(room["R"], c)), W)
         seen = self.load(self.at(room["seen"], c))
         inverse = f.div(splat(1.0, W), f.call("sqrt", [s], W), W)
         inverse = f.select(f.compare("ogt", seen, splat(0.0, W), W), inverse, splat(0.0, W), W)
@@ -173,12 +163,12 @@ class _Innovations(Pass):
 
     def write(self) -> None:
         f, n, N, w = self.f, self.n, self.N, self.W
-        m, blocks, spare = N if self.general else n, self.count["blocks"], self.room(N)
+        blocks, spare = self.count["blocks"], self.room(N)
         follow = self.wanted("track")
         with f.loop(self.L) as t, f.loop(self.B) as b:
             run = f.integer("add", f.integer("mul", t, self.B), b)
             A, k = self._of("A", run, N * N), self._of("k", run, n * N)
-            H, weight = self._of("H", run, n * N), self._of("weight", run, n)
+            weight = self._of("weight", run, n)
             with f.loop(blocks) as block:
                 x = self._rows("x", b, block, N)
                 with f.loop(N) as line:
@@ -187,15 +177,11 @@ class _Innovations(Pass):
                         value = f.fma(f.load_all(entries, j, w), f.load(place, 0, w), value, w)
                     self.store(value, self.at(spare, line))
                 values = self.all(spare, N)
-                for i, place in enumerate(self._rows("d", run, block, m)):
+                for i, place in enumerate(self._rows("d", run, block, n)):
                     values[i] = f.add(values[i], f.load(place, 0, w), w)
                 out = self._rows("out", run, block, n)
                 for c, place in enumerate(self._rows("r", run, block, n)):
-                    seen = values[c]
-                    if self.general:
-                        row = [f.load_all(H, c * N + j, w) for j in range(N)]
-                        seen = self.dot(row, values)
-                    missed = f.sub(f.load(place, 0, w), seen, w)
+                    missed = f.sub(f.load(place, 0, w), values[c], w)
                     eps = f.mul(missed, f.load_all(weight, c, w), w)
                     f.store(eps, out[c], 0, w)
                     gain = (f.load_all(k, c * N + i, w) for i in range(N))
@@ -203,7 +189,7 @@ class _Innovations(Pass):
                 for value, place in zip(values, x, strict=True):
                     f.store(value, place, 0, w)
                 with f.when(follow):
-                    for i, place in enumerate(self._rows("track", run, block, m)):
+                    for i, place in enumerate(self._rows("track", run, block, n)):
                         f.store(values[i], place, 0, w)
 
     def _of(self, name: str, run: str, size: int) -> str:
@@ -222,7 +208,7 @@ class _Smoother(Pass):
 
     def write(self) -> None:
         f, n, N = self.f, self.n, self.N
-        rooms = {"A": N * N, "H": n * N, "G": n * n, "k": n * N, "weight": n, "white": n}
+        rooms = {"A": N * N, "G": n * n, "k": n * N, "weight": n, "white": n}
         room = {name: self.room(size) for name, size in rooms.items()}
         q, P, spare = self.room(N), self.room(N * N), self.room(N * N)
         u, D, answer = self.room(n), self.room(n), self.room(N)
@@ -231,7 +217,7 @@ class _Smoother(Pass):
             self.clear(P, N * N)
             with f.loop(self.L, down=True) as t:
                 for name, size in rooms.items():
-                    if (name != "H" or self.general) and (name != "G" or self.through):
+                    if name != "G" or self.through:
                         self.gather(name, t, size, room[name])
                 with f.loop(n, down=True) as c:
                     self._channel(c, q, P, room, (u, D, spare))
@@ -271,19 +257,6 @@ class _Smoother(Pass):
         D = f.mul(self.dot(k, values, weight), weight, W)
         self.store(u, self.at(u_out, c))
         self.store(D, self.at(D_out, c))
-        source, h = self.channel(room["H"], c)
-        if h:
-            for i in range(N):
-                self.store(f.fma(h[i], u, self.load(q, i), W), q, i)
-            with f.loop(N) as line:
-                hi, ni = self.load(self.at(source, line)), self.load(self.at(NK, line))
-                left, down = f.sub(f.mul(hi, D, W), ni, W), f.neg(hi, W)
-                for j in self.each(N):
-                    place = self.at(self.at(P, line, N), j)
-                    hj, nj = self.load(self.at(source, j)), self.load(self.at(NK, j))
-                    value = f.fma(left, hj, self.load(place), W)
-                    self.store(f.fma(down, nj, value, W), place)
-            return
         place = self.at(q, c)
         self.store(f.add(self.load(place), u, W), place)
         row, column = self.at(P, c, N), self.at(P, c)

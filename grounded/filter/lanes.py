@@ -23,20 +23,17 @@ class Pass:
         N: states.
         width: W.
         through: whether disturbances enter through G.
-        general: whether there is an H.
     """
 
     name: str
 
-    def __init__(
-        self, names: Sequence[str], n: int, N: int, width: int, through: bool, general: bool
-    ) -> None:
+    def __init__(self, names: Sequence[str], n: int, N: int, width: int, through: bool) -> None:
         self.f = Writer(f"i64 @{self.name}(ptr %words)")
         words = Words(self.f, names)
         self.base = {w: words.pointer(w) for w in names if w not in INTEGERS}
         self.count = {w: words.integer(w) for w in names if w in INTEGERS}
         self.L, self.B = self.count["L"], self.count["B"]
-        self.n, self.N, self.W, self.through, self.general = n, N, width, through, general
+        self.n, self.N, self.W, self.through = n, N, width, through
         self.runs: list[str] = []
 
     def text(self) -> str:
@@ -151,8 +148,3 @@ class Pass:
                 mean = f.mul(mean, splat(0.5, self.W), self.W)
                 self.store(mean, P, below)
                 self.store(mean, P, above)
-
-    def channel(self, H: str, c: str) -> tuple[str, list[str]]:
-        """The address of a channel's row of H, and its entries; without H: nothing."""
-        row = self.at(H, c, self.N)
-        return row, self.all(row, self.N) if self.general else []
