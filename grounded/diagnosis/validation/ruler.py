@@ -258,93 +258,61 @@ class Ruler:
             The rms floor (K, n), NaN for whole trials if these are longer than the repeats, and the
             standard deviation of its logarithm (K,). None without repeats.
         """
-        data, h = self.data, fit.hypothesis
+        data, h, K = self.data, fit.hypothesis, len(self.steps)
         first = unseen(self.predictor, h)
-        begun = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
-        of_trial = dict(zip(data.trial_of[begun].tolist(), begun.tolist(), strict=True))
-        total = np.zeros((len(self.steps) + 1, data.model.n))
-        count, often = np.zeros_like(total), np.zeros(len(total))
-        cells: list[list[tuple[float, Array, Array]]] = [[] for _ in total]
+        starts = np.flatnonzero(data.step_at[:, 0] == self.step0[data.trial_of])
+        of_trial = dict(zip(data.trial_of[starts].tolist(), starts.tolist(), strict=True))
         longest = int(data.lengths[data.trial_of[self.wholes]].max())
+        total, count = np.zeros((2, K + 1, data.model.n))
+        powers = np.zeros((3, K + 1, data.model.n))  # of variances, over independent moments
+        often = np.zeros(K + 1)
         for group in repeats:
-            runs = np.array([of_trial[i] for i in group if i in of_trial])
-            runs = self._alike(h, fit.states, runs)
+            runs = self._alike(fit, np.array([of_trial[i] for i in group if i in of_trial], int))
             if len(runs) < 2:
                 continue
             length = int(data.lengths[data.trial_of[runs]].min())
-            own = int(data.valid[runs].sum(axis=1).min())
+            used = int(data.valid[runs].sum(axis=1).min())
             for k, steps in enumerate((*self.steps, length)):
-                if k == len(self.steps) and longest > (1 + ALIKE) * length:
-                    continue
-                last = min(own - 1, length - steps)
-                if last < 0:  # what is used of the runs is shorter than this horizon
-                    continue
-                often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
+                whole, last = k == K, min(used - 1, length - steps)
+                if last < 0 or (whole and longest > (1 + ALIKE) * length):
+                    continue  # what is used of the runs is shorter than this horizon
                 begin = min(int(self.starts[0].min()), last)
-                moments = np.unique(np.linspace(begin, last, MOMENTS).astype(int))
-                moments = np.zeros(1, int) if k == len(self.steps) else moments[moments >= 0]
+                several = np.unique(np.linspace(begin, last, MOMENTS).astype(int))
+                moments = np.zeros(1, int) if whole else several
                 at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
-                whole = k == len(self.steps)
                 most = steps if whole else max(steps, int(first.max()))
                 error = missed(self.predictor, [h], 0 * at, fit.states, at, run, most)
                 error = error[1:] if whole else at_steps(error, steps, first)[None]
                 error = error.reshape(len(error), len(runs), len(moments), -1)
-                there = np.asarray(np.isfinite(error).all(axis=1))
+                there = np.isfinite(error).all(axis=1)
                 spread = np.where(there, np.nan_to_num(error).var(axis=1, ddof=1), 0.0)
                 total[k] += spread.sum(axis=(0, 1))
                 count[k] += there.sum(axis=(0, 1))
-                apart = min(max(length // steps, 1) / max(len(moments), 1), 1.0)
-                cells[k].append((apart, spread.reshape(-1, data.model.n), there[0]))
-        if not (count[:-1][:, self._watched] > 0).all():
+                apart = min(max(length // steps, 1) / len(moments), 1.0) * (not whole)
+                powers[:, k] += apart * np.stack([there, spread, spread**2]).sum(axis=(1, 2))
+                often[k] += (len(runs) - 1) * np.clip(length // steps, 1, MOMENTS)
+        watched = [i for i in self.shown if data.seen[..., i].any()]
+        if not (count[:-1][:, watched] > 0).all():
             return None
         found = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
         found[:-1] = np.fmax.accumulate(found[:-1], axis=0)
-        unsure = 1 / np.sqrt(2 * np.maximum(often, 0.5))
-        for k in range(len(self.steps)):
-            unsure[k] = max(unsure[k], _uneven(cells[k])[self._watched].max())
-        return found, unsure
+        # how much the variance differs from moment to moment, as an error of its root's logarithm
+        alone, own, square = powers[..., watched]
+        mean = own / np.maximum(alone, 1e-12)
+        uneven = np.maximum(square - own * mean, 0.0) / np.maximum((alone - 1) * alone, 1e-12)
+        uneven = np.where((alone > 1) & (mean > 0), np.sqrt(uneven) / (2 * mean + 1e-300), 0.0)
+        return found, np.maximum(1 / np.sqrt(2 * np.maximum(often, 0.5)), uneven.max(axis=1))
 
-    def _alike(self, h: Hypothesis, track: Array, runs: Any) -> Any:
+    def _alike(self, fit: Fitted, runs: Any) -> Any:
         """Return the runs that are repeats, without those whose one-step errors are far larger.
 
         The errors of true repeats differ by noise only, so none can be far above the smallest.
         """
-        own = []
-        for run in runs:
-            at, steps = np.arange(1, int(self.data.valid[run].sum())), self.steps[0]
-            at = at[:: max(1, len(at) // MOMENTS)]
-            where = np.full(len(at), run)
-            error = missed(self.predictor, [h], 0 * at, track, at, where, steps)[-1]
-            squares = error[:, self._watched] ** 2
-            count = np.isfinite(squares).sum(axis=0)
-            own.append(np.where(count, np.sqrt(np.nansum(squares, axis=0) / count.clip(1)), np.nan))
-        if not own:
-            return runs
-        least = np.fmin.reduce(own) + self.fine[self._watched]
-        return runs[[not (one > WILD * least).any() for one in own]]  # NaN compares as False
-
-    @property
-    def _watched(self) -> list[int]:
-        """The shown states that have a measurement."""
-        return [i for i in self.shown if self.data.seen[..., i].any()]
-
-
-def _uneven(cells: Sequence[tuple[float, Array, Array]]) -> Array:
-    """Return the standard deviation of the logarithm of a noise's rms, by state (n,).
-
-    It follows from how much the variance differs from moment to moment, whatever that is due to.
-
-    Args:
-        cells: of each group of repeats the share of its M moments that are independent, the
-            variance at each (M, n), and whether it is known (M, n) or in one array (1, n).
-    """
-    each = np.concatenate([one for _, one, _ in cells])
-    weight = np.concatenate([w * np.broadcast_to(there, one.shape) for w, one, there in cells])
-    often = weight.sum(axis=0)
-    mean = (weight * each).sum(axis=0) / np.maximum(often, 1e-12)
-    spread = (weight * (each - mean) ** 2).sum(axis=0) / np.maximum(often - 1, 1)
-    few = np.sqrt(spread / np.maximum(often, 1)) / np.maximum(2 * mean, 1e-300)
-    return np.where((often > 1) & (mean > 0), few, 0.0)
+        found = self.errors(fit)
+        total, count = (self.by_run(a)[0][runs][:, self.shown] for a in (found.total, found.count))
+        each = np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan)
+        least = np.fmin.reduce(each, axis=0, initial=np.inf) + self.fine[self.shown]
+        return runs[~(each > WILD * least).any(axis=1)]
 
 
 def repeated(trials: Sequence[Trial], data: Data, first: int) -> list[list[int]]:
