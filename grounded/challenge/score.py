@@ -3,21 +3,20 @@
 The oracle fits only the true effects (values free, noise and parameters as in a diagnosis). A case
 counts as detectable if the evidence of the true effects exceeds 3 nats, and as distinguishable if
 it is also 3 nats above that of the likeliest other effects in the diagnosis' ranking, fitted in the
-same way. Held-out prediction errors of the diagnosis are compared with those of the oracle.
+same way.
 
 If a case has wrong parameters beside its effect, naming these is correct, too: the effect must be
 first among the other names, whether the parameters are calibrated together or named one by one.
 
-Other marks are a further name without a true effect (`false_second`), the right family at the wrong
-target (`wrong_place`), names that predict worse than the model without them (`worse`), and the
-reduction of the error in units (`units_shrinkage`). `summary` gives each share with its count and
-Wilson's 95 % interval.
+Other marks are a further name without a true effect (`false_second`), and names that predict worse
+than the model without them (`worse`). `summary` gives each share with its count and Wilson's 95 %
+interval.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,8 +26,6 @@ from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.measured import carried, gap_of
-from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Library
 from grounded.frozen import Array
 from grounded.model import Model
@@ -39,20 +36,18 @@ from grounded.utility import Reward
 Marks = Sequence[Mapping[str, Any]]
 DETECTABLE = 3.0  # nats
 WORSE = 1.01  # ratio of errors from which the named effects predict worse than none
-WITHIN, LEAVES = 1.15, 1.3  # ratio to the oracle's error; gap from which a false claim misleads
+LEAVES = 1.3  # gap from which a false claim misleads
 RIVALS = 2
 LATE = {"delay": "sensor_delay", "lag": "sensor_lag"}  # findings of the instruments as effects
 
 
 @dataclass(frozen=True)
 class Oracle:
-    """Evidence of the true effects over the best hypothesis without [nats]; their held-out gap."""
+    """Evidence of the true effects over the best hypothesis without them [nats]."""
 
     evidence: float
-    gap_after: float
     each: Mapping[str, float]  # what the evidence loses without each true effect
     rival: float = -np.inf  # evidence of the likeliest other [nats]
-    errors: Mapping[str, float] = field(default_factory=dict)  # 1 s ahead, held out, in units
 
 
 def oracle(
@@ -119,15 +114,9 @@ def oracle(
         rest = [j for j in everything if j != i]
         below = fitted(rest) if rest else search.score(search.best_null())
         each[effect.name] = whole - below
-    names = tuple(sorted(known))
-    best = next(f for f in search.of_size(len(known)) if tuple(sorted(f.hypothesis.names)) == names)
     none = search.score(search.best_null())
     rivals = [fitted([len(known) + i]) - none for i in range(len(others))]
-    ruler = Ruler(search.predictor)
-    gap = gap_of(ruler, best, carried(ruler, best))
-    rms = ruler.errors(best).rms[len(ruler.steps) - 1, ruler.shown]
-    errors = dict(zip(ruler.names, map(float, rms), strict=True))
-    return Oracle(whole - none, gap, each, max(rivals, default=-np.inf), errors)
+    return Oracle(whole - none, each, max(rivals, default=-np.inf))
 
 
 def _plain(search: HypothesisSearch) -> list[Any]:
@@ -165,7 +154,6 @@ def judge(
         "named": named,
         "first": bool(truth) and order[:1] == truth[:1],
         "in_group": bool(truth) and truth[0] in group,
-        "top3": bool(truth) and truth[0] in order[:3],
         "both": set(truth) <= set(named),
         "both_in_group": _matched(truth, named, diagnosis["indistinguishable"]),
         "leftover": bool(diagnosis["leftover"]),
@@ -173,19 +161,14 @@ def judge(
         "system": label["system"],
         "false_effect": not truth and bool(_physical(named, label)),
         "false_second": bool(truth) and _spare(truth, named, label) > 0,
-        "wrong_place": _misplaced(truth, order),
+        "covered": _covered(label, diagnosis),
         "worse": bool(named) and _ratio(diagnosis, _without(diagnosis)) > WORSE,
-        "units_shrinkage": 1 - _ratio(diagnosis, _row(diagnosis).get("crude", {})),
     }
     if known is not None:
         marks["evidence"] = known.evidence
         marks["detectable"] = known.evidence > DETECTABLE
         marks["distinguishable"] = known.evidence > max(known.rival, 0.0) + DETECTABLE
         marks["each_detectable"] = all(v > DETECTABLE for v in known.each.values())
-        left = diagnosis["gap"]["after"]  # null for a case that was refused: all is left
-        marks["gap_ratio"] = np.inf if left is None else left / max(known.gap_after, 1e-9)
-        marks["units_ratio"] = _ratio(diagnosis, known.errors)
-    marks |= _values(label, diagnosis)
     return marks
 
 
@@ -226,13 +209,6 @@ def _matched(truth: Sequence[str], named: Sequence[str], ties: Sequence[Sequence
     return True
 
 
-def _misplaced(truth: Sequence[str], order: Sequence[str]) -> bool:
-    """Check whether the first name has a true family but the wrong target."""
-    if not truth or not order or order[0] in truth:
-        return False
-    return order[0].partition(":")[0] in {name.partition(":")[0] for name in truth}
-
-
 def _row(diagnosis: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the row of prediction errors at the longest horizon but the whole trial."""
     rows = [row for row in diagnosis.get("prediction_error", ()) if not row["whole_trial"]]
@@ -254,21 +230,15 @@ def _ratio(diagnosis: Mapping[str, Any], other: Mapping[str, float]) -> float:
     return float(np.exp(np.mean(logs))) if logs else float("nan")
 
 
-def _values(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> dict[str, Any]:
-    """Return errors and interval coverage of the values of true effects that were claimed."""
-    covered, errors = [], []
-    rows = {r["effect"]: r for r in diagnosis["ranking"] if r["claimed"]}
+def _covered(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[bool]:
+    """Return whether each interval of a value of a claimed true effect holds the true one."""
+    rows = {r["effect"]: r["params"] for r in diagnosis["ranking"] if r["claimed"]}
+    found = []
     for entry in label["effects"]:
-        row = rows.get(entry["effect"])
-        if row is None:
-            continue
-        for name, estimate in row["params"].items():
-            true = float(entry["params"][name])
+        for name, estimate in rows.get(entry["effect"], {}).items():
             if (interval := estimate.get("interval")) is not None:  # its std may be unknown
-                covered.append(bool(interval[0] <= true <= interval[1]))
-            if abs(true) > 1e-12:
-                errors.append(abs(estimate["value"] - true) / abs(true))
-    return {"covered": covered, "errors": errors}
+                found.append(bool(interval[0] <= float(entry["params"][name]) <= interval[1]))
+    return found
 
 
 def summary(marks: Marks) -> dict[str, Any]:
@@ -296,10 +266,6 @@ def _single(some: Marks) -> dict[str, Any]:
         "first": _part(seen, "first"),
         "first_of_distinguishable": _part(apart, "first"),
         "in_group": _part(seen, "in_group"),
-        "top3": _part(seen, "top3"),
-        "first_of_all": _part(some, "first"),
-        "leftover": _part(seen, "leftover"),
-        "wrong_place": _part(seen, "wrong_place"),
         **_of_effects(some),
     }
 
@@ -311,19 +277,9 @@ def _double(some: Marks) -> dict[str, Any]:
 
 
 def _of_effects(some: Marks) -> dict[str, Any]:
-    """Return figures for cases with effects: false names, coverage, predictions over oracle's."""
-    gaps = [m["gap_ratio"] for m in some if m.get("detectable")]
-    units = [m["units_ratio"] for m in some if np.isfinite(m.get("units_ratio", np.nan))]
-    return {
-        "false_second": _part(some, "false_second"),
-        "coverage": share(c for m in some for c in m["covered"]),
-        "gap_ratio_median": _median(gaps),
-        "gap_within_1.15": share(r < WITHIN for r in gaps),
-        "units_ratio_median": _median(units),
-        "units_within_1.15": share(r < WITHIN for r in units),
-        "units_shrinkage_median": _median([m["units_shrinkage"] for m in some]),
-        "param_error_median": _median([e for m in some for e in m["errors"]]),
-    }
+    """Return figures for cases with effects: false names, and intervals that hold."""
+    covered = share(c for m in some for c in m["covered"])
+    return {"false_second": _part(some, "false_second"), "coverage": covered}
 
 
 def _none(some: Marks) -> dict[str, Any]:
@@ -342,11 +298,6 @@ def _withheld(some: Marks) -> dict[str, Any]:
 
 
 OF_KIND = {"single": _single, "double": _double, "none": _none, "withheld": _withheld}
-
-
-def _median(values: Sequence[float]) -> float | None:
-    known = [v for v in values if np.isfinite(v)]
-    return float(np.median(known)) if known else None
 
 
 def _part(marks: Marks, key: str) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from grounded.compile import Problem
 from grounded.diagnosis.excitation import KnownNoise, information, safe
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
-from grounded.diagnosis.validation.limits import WEAK
+from grounded.diagnosis.validation.identifiable import WEAK
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import simulate
@@ -125,7 +125,7 @@ def told_by(task: Task, runs: Sequence[Trial], noise: Array) -> dict[str, float]
 def _precision(task: Task, runs: Sequence[Trial], known: KnownNoise) -> Array:
     """Return I + F of runs, in units of the parameters' priors."""
     h = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0)
-    F = information(task, runs, h, known).sum(axis=0)
+    F = information(task, runs, h, known)
     return np.asarray(F + np.eye(len(F)))
 
 

@@ -39,12 +39,8 @@ from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.diagnosis.parts import Diagnosis
 from grounded.diagnosis.validation.agreement import compared
 from grounded.diagnosis.validation.decide import Decision, beside_lookalikes, decide
-from grounded.diagnosis.validation.limits import (
-    held,
-    knowable,
-    sound_data,
-    without_others,
-)
+from grounded.diagnosis.validation.identifiable import held
+from grounded.diagnosis.validation.limits import knowable, sound_data, without_others
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.writer import MOST_EFFECTS, Writer
 from grounded.effects import Effect, Library, param_name

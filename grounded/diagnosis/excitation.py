@@ -17,13 +17,11 @@ expected gain is
 
     1/2 log det(F + J) / det F
 
-The predicted `+-` is the one that the next diagnosis will state. That includes a jackknife over
-trials, which does not trust a value determined by one trial alone (`intervals.foretold`). So if a
-second run would reduce it much further, the prediction is for two runs. If predictions miss by more
-than the noise, those of a new motion will, too, and J is reduced accordingly. States that no trial
-measured are not measured in the probe's run, either. F and J are those of a linear model, and a
-limit is a kink: nothing better than a tenth of the present `+-` is promised. A value that is known
-to WELL is no reason for a probe while there is a gap without a cause, or an unconfirmed effect.
+The predicted `+-` is that of F + J, for a model that is right. If predictions miss by more than the
+noise, those of a new motion will, too, and J is reduced accordingly. States that no trial measured
+are not measured in the probe's run, either. A limit is a kink: nothing better than a tenth of the
+present `+-` is promised. A value that is known to WELL is no reason for a probe while there is a
+gap without a cause, or an unconfirmed effect.
 
 The probe stays inside the limits of the inputs, and the runs of both hypotheses inside the task's
 safety limits.
@@ -42,7 +40,6 @@ from grounded.diagnosis.hypotheses.variations import in_place
 from grounded.diagnosis.levels import NATS, SHOWS, WELL
 from grounded.diagnosis.likelihood.data import Data, prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
-from grounded.diagnosis.likelihood.intervals import foretold
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
@@ -72,7 +69,7 @@ class Probe:
 
     `about`: the two effects that it separates, or the value whose `+-` it reduces most.
     `little`: whether that is too little to be worth a trial. `std`: the standard deviation of that
-    value, in its unit, as a diagnosis will state it after `runs` runs.
+    value, in its unit, after a run.
     """
 
     policy: Policy
@@ -81,7 +78,6 @@ class Probe:
     step: Finding
     little: bool = False
     std: float = np.nan
-    runs: int = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,12 +133,13 @@ def probe(
     rival = _effect(library, group[1], task, diagnosis, _scales(task, trials))
     second = in_place(first, {group[0]: ((rival, diagnosis.values(group[1])),)})
     noise = KnownNoise.of(task.model, diagnosis)
-    second = _adapted(task, list(trials[-REPLAYED:]), second, noise)
     latest = trials[-REPLAYED:]
-    replayed = ([_run(task, h, policy, trial) for trial in latest] for h in (first, second))
-    again = [[run for run in runs if run is not None] for runs in replayed]
-    ways = [_Way(task, noise, first, second, again[0]), _Way(task, noise, second, first, again[1])]
-    told = ways[0].known * len(trials) / max(len(again[0]), 1)
+    second = _adapted(task, latest, second, noise)
+    ways = []
+    for true, other in ((first, second), (second, first)):
+        runs = (_run(task, true, policy, trial) for trial in latest)
+        ways.append(_Way(task, noise, true, other, [run for run in runs if run is not None]))
+    told = ways[0].known * len(trials) / max(len(ways[0].trials), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
     apart = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]
     trust = min(1.0, max(NATS, float(np.ptp(apart))) / max(told, 1e-12))
@@ -173,107 +170,59 @@ def _teaching(
     task: Task, policy: Policy, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> Probe | None:
     """Find the probe that gives most information on claimed and calibrated values."""
-    asked = _asked(task, diagnosis, trials, library)
-    if asked is None:
-        return None
-    task, h, spreads, each = asked
-    noise, best = KnownNoise.of(task.model, diagnosis), None
-    std, values = np.array([*each.values()]).T
-    groups = information(task, trials, h, noise)
-    if groups.shape[1:] != (len(std), len(std)) or not np.isfinite(groups).all():
-        return None
-    F = groups.sum(axis=0)
-    own = np.maximum(np.diag(F), 1 / np.maximum(std, NO_INFORMATION) ** 2)  # or that of the priors
-    unit_of = 1 / np.sqrt(own)
-    groups, prior = (
-        groups * np.outer(unit_of, unit_of),
-        np.diag(1 - np.diag(F) / own + NO_INFORMATION),
-    )
-    F = groups.sum(axis=0) + prior
-    unseen = np.isnan(np.concatenate([trial.states for trial in trials])).all(axis=0)
-    for words, candidate in probes(policy, task.model, range(task.model.m)):
-        run = _run(task, h, candidate)
-        if not safe(task, run):
-            continue
-        assert run is not None
-        J = information(task, [run], h, noise, unseen)
-        if J.shape[1:] != F.shape or not np.isfinite(J).all():
-            continue
-        J = J * np.outer(unit_of, unit_of)
-        gain = 0.5 * float(np.linalg.slogdet(F + J[0])[1] - np.linalg.slogdet(F)[1])
-        if best is None or gain > best[0]:
-            best = (gain, candidate, words, J)
-    if best is None:
-        return None
-    gain, chosen, words, J = best
-    once, twice = _left(groups, J, prior, std / unit_of, _misfit(diagnosis))
-    well = bool(diagnosis.leftover or diagnosis.unconfirmed) & (std < WELL * np.abs(values))
-    k = int(np.argmin(np.where((std > 0) & (~well | well[std > 0].all()), twice, np.inf)))
-    again = bool(twice[k] < (1 - SHOWS) * once[k])
-    shrunk = max(float(twice[k] if again else once[k]), PROMISED_SHARE)
-    name = list(spreads)[k]
-    of = spreads[name].unit
-    now = float(spreads[name].std)
-    then, called = now * shrunk, value_called(name, (diagnosis.made or Made()).effects)
-    motion = diagnosis.motions == 1 < len(trials) and words != BASE
-    little = not motion and (shrunk > 1 - SHOWS or bool(well[k]))
-    step = found("gap.next.no_probe", name, value=called)
-    if motion:
-        step = found("gap.next.probe", name, probe=words, motion=True)
-    elif not little:
-        ends: dict[str, Any] = {"after": Quantity(then, of), "now": Quantity(now, of)}
-        twice_run = 2 if again else None
-        step = found("gap.next.probe", name, probe=words, value=called, runs=twice_run, **ends)
-    return Probe(chosen, gain, (name,), step, little, then, 1 + again)
-
-
-def _asked(
-    task: Task, diagnosis: Diagnosis, trials: Sequence[Trial], library: Library
-) -> tuple[Task, Hypothesis, dict[str, Estimate], dict[str, tuple[float, float]]] | None:
-    """Return the calibrated task, the hypothesis of a diagnosis, and its values; None without any.
-
-    They are the values by name, and of each the standard deviation and the value in the unit of its
-    column.
-    """
-    (task, h), spreads = _claim(task, diagnosis, trials, library), dict[str, Estimate]()
+    (task, h), known = _claim(task, diagnosis, trials, library), list[tuple[str, Estimate, float]]()
+    # the values, each with its name and the unit of its column
     for effect in h.effects:
         row = diagnosis.ranked(effect.name)
         if row is None:
             return None
-        spreads |= {f"{q.name} of {effect.name}": row.params[q.name] for q in effect.free}
-    model = task.model
-    sizes = {n: float(s) for n, s in zip(model.param_names, param_scale(model), strict=True)}
-    for n in (n for n, size in sizes.items() if size > 0 and h.spread):
-        unit = model.params[n].unit
-        spreads[n] = replace(diagnosis.parameters.get(n, Estimate(0.0, 0.0)), unit=unit)
-    each = {
-        n: (e.std / size if np.isfinite(e.std) else 0.0, e.value / size)
-        for n, e in spreads.items()
-        for size in [sizes.get(n, 1.0)]
-    }
-    return (task, h, spreads, each) if any(std for std, _ in each.values()) else None
-
-
-def _left(groups: Array, J: Array, prior: Array, stated: Array, misfit: float) -> tuple[Array, ...]:
-    """Return what a run, and two, leave of the stated standard deviations, as fractions, (C,) each.
-
-    A value that one trial alone determines has no expected jackknife: without that trial nothing is
-    known of it. What was stated is less, and counts: of a limit that one of seven runs had reached,
-    a thousandth of its `+-` was promised to remain, and a third did.
-
-    Args:
-        groups: information of each trial so far (S, C, C).
-        J: that of the probe's run (1, C, C).
-        prior: information that no trial adds (C, C).
-        stated: standard deviations that the diagnosis states, (C,); 0 if it states none.
-        misfit: by how much predictions miss more than by noise.
-    """
-    told = stated > 0
-    before = np.where(told, np.minimum(foretold(groups, prior), stated), 1.0)
-    wider = float(np.median((stated / before)[told]))  # than if the model were right
-    J = J / max(misfit / wider, 1.0) ** 2
-    after = (foretold(np.concatenate([groups, *[J] * n]), prior) for n in (1, 2))
-    return tuple(np.minimum(std / before, 1.0) for std in after)
+        known += [(f"{q.name} of {effect.name}", row.params[q.name], 1.0) for q in effect.free]
+    for (name, param), size in zip(task.model.params.items(), param_scale(task.model), strict=True):
+        if size > 0 and h.spread:
+            e = diagnosis.parameters.get(name, Estimate(0.0, 0.0))
+            known.append((name, replace(e, unit=param.unit), float(size)))
+    std = np.array([e.std / size if np.isfinite(e.std) else 0.0 for _, e, size in known])
+    if not std.any():
+        return None
+    # information so far, or that of the priors; each column in the unit of what is known of it
+    noise, best = KnownNoise.of(task.model, diagnosis), None
+    F = information(task, trials, h, noise)
+    if F.shape != (len(std), len(std)) or not np.isfinite(F).all():
+        return None
+    own = np.maximum(np.diag(F), 1 / np.maximum(std, NO_INFORMATION) ** 2)
+    unit = np.outer(own, own) ** -0.5
+    F = F * unit + np.diag(1 - np.diag(F) / own + NO_INFORMATION)
+    unseen = np.isnan(np.concatenate([trial.states for trial in trials])).all(axis=0)
+    for words, candidate in probes(policy, task.model, range(task.model.m)):
+        run = _run(task, h, candidate)
+        if run is None or not safe(task, run):
+            continue
+        J = information(task, [run], h, noise, unseen)
+        if J.shape == F.shape and np.isfinite(J).all():
+            J = J * unit / _misfit(diagnosis) ** 2
+            gain = 0.5 * float(np.linalg.slogdet(F + J)[1] - np.linalg.slogdet(F)[1])
+            if best is None or gain > best[0]:
+                best = (gain, candidate, words, J)
+    if best is None:
+        return None
+    # the value that it tells better than any other, of those that are not known well already
+    gain, chosen, words, J = best
+    left = np.sqrt(np.diag(np.linalg.inv(F + J)) / np.diag(np.linalg.inv(F)))
+    values = np.array([e.value / size for _, e, size in known])
+    well = bool(diagnosis.leftover or diagnosis.unconfirmed) & (std < WELL * np.abs(values))
+    k = int(np.argmin(np.where((std > 0) & (~well | well[std > 0].all()), left, np.inf)))
+    name, e, _ = known[k]
+    then = e.std * max(float(left[k]), PROMISED_SHARE)
+    called = value_called(name, (diagnosis.made or Made()).effects)
+    motion = diagnosis.motions == 1 < len(trials) and words != BASE
+    little = not motion and bool(left[k] > 1 - SHOWS or well[k])
+    step = found("gap.next.no_probe", name, value=called)
+    if motion:
+        step = found("gap.next.probe", name, probe=words, motion=True)
+    elif not little:
+        ends: dict[str, Any] = {"after": Quantity(then, e.unit), "now": Quantity(e.std, e.unit)}
+        step = found("gap.next.probe", name, probe=words, value=called, **ends)
+    return Probe(chosen, gain, (name,), step, little, then)
 
 
 def _misfit(diagnosis: Diagnosis) -> float:
@@ -285,7 +234,7 @@ def _misfit(diagnosis: Diagnosis) -> float:
 def information(
     task: Task, runs: Sequence[Trial], h: Hypothesis, noise: KnownNoise, unseen: Array | None = None
 ) -> Array:
-    """Return the Fisher information of each run on a hypothesis' values, (S, C, C).
+    """Return the Fisher information of runs on a hypothesis' values, (C, C).
 
     `unseen`: mask (n,) of states that will not be measured in predicted runs.
     """
@@ -298,10 +247,7 @@ def information(
         iterations = SETTLED  # an unmeasured state has no track yet
     start = [(h, noise.model, track)]
     fits = refine(Predictor(data), start, iterations=iterations, fixed_noise=True)
-    by = np.zeros((len(runs), *(fits[0].gram.shape[1:] if fits else (0, 0))))
-    if fits:
-        np.add.at(by, data.trial_of, fits[0].gram)
-    return by
+    return fits[0].gram.sum(axis=0) if fits else np.zeros((0, 0))
 
 
 def _inputs_of(model: Model, names: Sequence[str]) -> list[int]:
@@ -357,7 +303,7 @@ def _effect(
     return delay_again(effect, float(adopted.effects[name]["d"]), float(late.min()))
 
 
-def _adapted(task: Task, runs: list[Trial], h: Hypothesis, noise: KnownNoise) -> Hypothesis:
+def _adapted(task: Task, runs: Sequence[Trial], h: Hypothesis, noise: KnownNoise) -> Hypothesis:
     """Return a hypothesis with the values fitted to some runs."""
     data = noise.data(task, runs)
     start = [(h, noise.model, data.y.copy())]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +15,6 @@ from grounded.diagnosis.error_report import (
     ChannelShare,
     Credit,
     Gap,
-    Identifiable,
     Remainder,
     RulerRow,
     Where,
@@ -27,12 +26,11 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import correction
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import (
     Changed,
     Diagnosis,
-    Estimate,
     NoiseLevels,
     Ranked,
     Score,
@@ -44,7 +42,7 @@ from grounded.diagnosis.remarks import next_step, remarks
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, Doubtful
-from grounded.diagnosis.validation.limits import Sound, identifiable
+from grounded.diagnosis.validation.limits import Sound
 from grounded.diagnosis.validation.measured import (
     Measured,
     by_region,
@@ -86,7 +84,7 @@ class Writer:
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, self.trials, sound.first, sound.exact)
         self.claims = Claims(decision, self.measured.credit, self.known, ruler, uncertain)
-        self.left, self.uncertain = self.measured.left, uncertain
+        self.left = self.measured.left
 
     def diagnosis(self, apart: tuple[Changed, ...] | None = None) -> Diagnosis:
         """All of it; `apart` is what differs between two groups of trials, if there are two."""
@@ -113,20 +111,7 @@ class Writer:
         seen = unconfirmed(self.claims, self.decision.doubtful, groups)
         values, agreement = by_trial(self.best, data, named) if named else ((), ())
         moved, parameters = len(data.groups), self.claims.parameters()
-        identified = tuple(_identified(self.uncertain, self.best, parameters))
-        combinations = self.claims.by_priors.combinations
-        joint = {name for one in combinations for name in (*one.values, *one.rests_on)}
-        joint &= parameters.keys()
-        # what predicts no other trial is adopted only if it is known
-        held_out = self.ruler.held_out
-        identified = tuple(
-            replace(
-                one,
-                jointly=(one.jointly or one.parameter in joint)
-                and (held_out or one.verdict != "not identifiable"),
-            )
-            for one in identified
-        )
+        identified = self.claims.identified
         said = self.verdict(ranking, remainder, rows, credit)
         found = Diagnosis(
             verdict=said,
@@ -157,8 +142,8 @@ class Writer:
             correction=correction(self.ruler, self.best, self.left),
             noise=self.noise(),
             parameters=parameters,
-            identifiable=identified,
-            combinations=combinations,
+            identifiable=identified.parameters,
+            combinations=identified.combinations,
             prediction_error=rows,
             credit=credit,
             per_trial=values,
@@ -288,15 +273,6 @@ def _tracked(task: Task) -> tuple[str, ...]:
     first = position(task.model)
     rates = {n for n in names if task.model.states[n].endswith("/s")}
     return tuple(sorted(names, key=lambda n: (n not in first, n in rates)))
-
-
-def _identified(
-    uncertain: Predictor, best: Fitted, known: Mapping[str, Estimate]
-) -> list[Identifiable]:
-    """Of all uncertain parameters, those that were held too, beside the best hypothesis."""
-    if not param_scale(uncertain.data.model).any():
-        return []
-    return identifiable(uncertain, best, known)
 
 
 def _in_action(h: Hypothesis, claimed: Sequence[str]) -> tuple[str, ...]:

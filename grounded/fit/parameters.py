@@ -32,7 +32,8 @@ from grounded.diagnosis.likelihood.polish import EVIDENCE_SETTLED as STILL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.validation.limits import held, sound_data
+from grounded.diagnosis.validation.identifiable import held
+from grounded.diagnosis.validation.limits import sound_data
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.effects.actuator import delay_again

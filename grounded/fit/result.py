@@ -19,7 +19,7 @@ from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.choose import Gain
-from grounded.diagnosis.validation.limits import UNKNOWN, identifiable
+from grounded.diagnosis.validation.identifiable import UNKNOWN, identified
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.findings import Finding
 from grounded.findings import found as finding
@@ -180,7 +180,7 @@ class Found:
             for name, k in self.at.items()
             if name in self.values
         }
-        return {one.parameter: one for one in identifiable(self.free, self.best, known)}
+        return {one.parameter: one for one in identified(self.free, self.best, known).parameters}
 
 
 def errors_of(ruler: Ruler, fit: Fitted) -> PredictionError:

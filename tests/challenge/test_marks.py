@@ -125,7 +125,7 @@ def marks_of(truth, named, *, errors=(1.0, 1.0), kind="single", param_error=0.0,
     return judge(label, found, known)
 
 
-def test_a_value_whose_uncertainty_is_unknown_counts_as_an_error_but_covers_nothing():
+def test_a_value_whose_uncertainty_is_unknown_covers_nothing():
     label = {"effects": [{"effect": "patch:a", "params": {"c": 2.0, "x0": 1.0}}], "case": "x"}
     label |= {"kind": "single", "noise": "white", "system": "car", "param_error": 0.0}
     row = {"whole_trial": False, "crude": {"v": 1.0}, "with_effects": {"v": 0.5}}
@@ -133,8 +133,7 @@ def test_a_value_whose_uncertainty_is_unknown_counts_as_an_error_but_covers_noth
     found = {"verdict": {"kind": "effect", "effects": ["patch:a"]}, "indistinguishable": []}
     found["ranking"] = [{"effect": "patch:a", "params": params, "claimed": True}]
     found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": [row]}
-    marks = judge(label, found, None)
-    assert marks["covered"] == [True] and marks["errors"] == pytest.approx([0.5, 0.1])
+    assert judge(label, found, None)["covered"] == [True]
 
 
 def test_a_second_name_that_nothing_makes_is_counted():
@@ -153,7 +152,7 @@ def test_what_is_likeliest_and_not_named_is_not_first():
     found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": []}
     found["ranking"] = [{"effect": "delay:a", "params": {}, "claimed": False}]
     marks = judge(label, found, None)
-    assert not (marks["first"] or marks["in_group"] or marks["top3"])
+    assert not (marks["first"] or marks["in_group"])
 
 
 def test_beside_parameters_that_are_off_the_effect_has_to_be_first_of_the_others():
@@ -178,15 +177,13 @@ def test_a_shift_of_a_parameter_is_counted_from_the_crude_value():
 
 
 def test_what_a_rival_explains_as_well_is_not_distinguishable():
-    close, ahead = (Oracle(20.0, 1.0, {"delay:a": 20.0}, rival, {"v": 0.5}) for rival in (18, 9))
+    close, ahead = (Oracle(20.0, {"delay:a": 20.0}, rival) for rival in (18, 9))
     marks = [marks_of("delay:a", ["stall:a"], known=close)]
     marks.append(marks_of("delay:a", ["delay:a"], errors=(1.0, 0.6), known=ahead))
     assert [m["distinguishable"] for m in marks] == [False, True]
-    assert marks[1]["units_ratio"] == pytest.approx(1.2)
     row = summary(marks)["single"]
     assert row["first"]["of"] == 2 and row["first"]["share"] == 0.5
     assert row["first_of_distinguishable"] == share([True])
-    assert row["units_shrinkage_median"] == pytest.approx(0.2)  # of 0 and 40 %
 
 
 def test_shares_have_the_interval_of_wilson():

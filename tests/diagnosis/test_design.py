@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from grounded.diagnosis.design import design, told_by, uncertain
-from grounded.diagnosis.validation.limits import WEAK
+from grounded.diagnosis.validation.identifiable import WEAK
 from grounded.model import Param
 from grounded.models import arm, cart_pole, pendulum
 from grounded.rollout import simulate

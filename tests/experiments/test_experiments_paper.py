@@ -82,10 +82,7 @@ def test_theorem1_has_its_slopes_and_keeps_its_bound():
     assert document["slopes"]["gradient_error"]["slope"] == pytest.approx(1.0, abs=0.1)
     assert document["slopes"]["squared_gradient"]["slope"] == pytest.approx(2.0, abs=0.2)
     assert document["largest_ratio_to_bound"] <= 1.0
-    known = document["K"]
-    assert known["measured"] == max(row["K"] for row in document["rows"])
-    assert all(row["K"] <= row["proof_K"] <= known["proof"] for row in document["rows"])
-    assert known["proof"] < 1e4  # far above what is measured, but no void statement
+    assert document["K"] == max(row["K"] for row in document["rows"])
 
 
 def test_the_model_of_theorem1_is_wrong_by_epsilon():

@@ -9,7 +9,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.limits import identifiable
+from grounded.diagnosis.validation.identifiable import identified
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.fit import fit
@@ -80,7 +80,9 @@ def test_a_parameter_that_is_found_off_is_identified_by_what_shows_that():
     start = search.fresh(Hypothesis(shift=np.zeros(3), spread=1.0).plus(off, {"d": 1.0}))
     (found, *_) = search.refined([start], 12)
     assert found.hypothesis.values[0]["d"] == pytest.approx(1.0, abs=0.1)
-    verdicts = {one.parameter: one.verdict for one in identifiable(search.predictor, found)}
+    verdicts = {
+        one.parameter: one.verdict for one in identified(search.predictor, found).parameters
+    }
     assert verdicts == {"gain": "identifiable", "drag": "identifiable"}
 
 

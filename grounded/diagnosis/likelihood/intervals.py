@@ -233,28 +233,3 @@ def fisher(information: Array) -> Array:
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     size, axes = np.linalg.eigh(information * np.outer(scale, scale))
     return np.asarray(scale * np.sqrt((axes**2 / np.maximum(size, 1e-12)).sum(axis=1)))
-
-
-def foretold(groups: Array, prior: Array) -> Array:
-    """Return the expected result of `standard_deviations` if the model is right.
-
-    Trials have scores s_i ~ N(0, G_i). At the most likely values, with G the sum of all and the
-    prior, the scores have the covariance G_i - G_i G^-1 G_i. Leaving out trial i moves the values
-    by (G - G_i)^-1 s_i. So a single trial with more information than all others does not make the
-    jackknife's standard deviation small.
-
-    Args:
-        groups: information of each trial (S, C, C).
-        prior: information that no trial adds (C, C).
-
-    Returns:
-        Standard deviations (C,).
-    """
-    total, count = groups.sum(axis=0) + prior, len(groups)
-    inverse = np.linalg.pinv(total, hermitian=True)
-    fisher, scatter = np.diag(inverse), np.zeros(len(total))
-    for own in groups if count >= 3 else ():
-        rest = np.linalg.pinv(total - own, hermitian=True)
-        scatter += np.diag(rest @ (own - own @ inverse @ own) @ rest)
-    variance = np.maximum(fisher, (count - 1) / max(count, 1) * scatter)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))

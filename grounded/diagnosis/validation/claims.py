@@ -26,13 +26,11 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Likeness, Ranked
 from grounded.diagnosis.validation.certainty import (
     Blame,
-    ByPriors,
-    Key,
     averaged,
-    by_priors,
     moved_parameters,
 )
 from grounded.diagnosis.validation.decide import Decision
+from grounded.diagnosis.validation.identifiable import Identified, identified
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
 from grounded.diagnosis.validation.measured import Measured, ordered
 from grounded.diagnosis.validation.ruler import Ruler
@@ -151,26 +149,35 @@ class Claims:
 
     @cached_property
     def _sure(self) -> tuple[Array, Array]:
-        """Model-averaged standard deviations and half-widths of the claim's values."""
-        keys = [(e.name, q.name) for e in self.best.hypothesis.effects for q in e.free]
-        return self._widened(averaged(self.search, self.best, self.ruler), keys)
-
-    @cached_property
-    def by_priors(self) -> ByPriors:
-        """Which values only priors set."""
-        return by_priors(self._uncertain, self.best, self.search.tempering.factor)
-
-    def _widened(self, sure: tuple[Array, Array], keys: Sequence[Key]) -> tuple[Array, Array]:
-        """Return standard deviations and half-widths, (C,) each, of at least those by priors.
+        """Model-averaged standard deviations and half-widths of the claim's values, (C,) each.
 
         A fit may hold its parameters, or keep them to a fraction of their priors. Of values that
-        only priors set, that would state what no data told. `keys` name the first of the values.
+        only priors set, that would state what no data told; so they are as wide as these.
         """
-        std, half = (np.array(a) for a in sure)
-        for i, key in enumerate(keys):
-            std[i] = max(std[i], self.by_priors.std.get(key, 0.0))
-            half[i] = max(half[i], NORMAL * self.by_priors.std.get(key, 0.0))
+        std, half = averaged(self.search, self.best, self.ruler)
+        keys = [(e.name, q.name) for e in self.best.hypothesis.effects for q in e.free]
+        wide = np.array([self.identified.std.get(key, 0.0) for key in keys])
+        std[: len(keys)] = np.maximum(std[: len(keys)], wide)
+        half[: len(keys)] = np.maximum(half[: len(keys)], NORMAL * wide)
         return std, half
+
+    @cached_property
+    def identified(self) -> Identified:
+        """What the data determine beside the claim, and which values only priors set."""
+        known = {name: Estimate(value, std) for name, value, std, _ in self._calibrated}
+        return identified(self._uncertain, self.best, known, held_out=self.ruler.held_out)
+
+    @cached_property
+    def _calibrated(self) -> list[tuple[str, float, float, float]]:
+        """The calibrated parameters by the fit: name, value, standard deviation, half-width."""
+        h, model = self.best.hypothesis, self.data.model
+        if h.spread == 0 or h.shift is None:
+            return []
+        which, scale = calibrated(self.data), param_scale(model)
+        std, half = (a[len(h.theta) :] * scale[which] for a in self.search.sure(self.best))
+        values = (model.values + h.shift)[which]
+        names = [model.param_names[i] for i in which]
+        return [*zip(names, *(a.tolist() for a in (values, std, half)), strict=True)]
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Return groups of indistinguishable explanations, the claimed one first in each.
@@ -297,20 +304,12 @@ class Claims:
 
     def parameters(self) -> dict[str, Estimate]:
         """Return the values of the model's parameters, if they were calibrated."""
-        h, model = self.best.hypothesis, self.data.model
-        if h.spread == 0 or h.shift is None:
-            return {}
-        which, scale, k = calibrated(self.data), param_scale(model), len(h.theta)
-        own = tuple(a[k:] * scale[which] for a in self.search.sure(self.best))
-        keys = [("", model.param_names[i]) for i in which]
         found = {}
-        for i, (_, name), *sure in zip(which, keys, *self._widened(own, keys), strict=True):
-            param, value, (std, half) = model.params[name], model.values[i] + h.shift[i], sure
-            found[name] = replace(
-                _estimate(float(value), float(std), float(half), param.unit),
-                std=float(std),
-                stopped=param.stopped(float(value)),
-            )
+        for name, value, std, half in self._calibrated:
+            param, wide = self.data.model.params[name], self.identified.std.get(("", name), 0.0)
+            std, half = max(std, wide), max(half, NORMAL * wide)
+            one = _estimate(value, std, half, param.unit)
+            found[name] = replace(one, std=std, stopped=param.stopped(value))
         return found
 
 

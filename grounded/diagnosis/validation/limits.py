@@ -17,13 +17,8 @@ from grounded.accounts.finding import Preflight
 from grounded.accounts.lag import whole_steps
 from grounded.accounts.sound_trials import sound_trials
 from grounded.checks import refused
-from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.data import PIECES, SHORTEST_PIECE, Data, prepare
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.parts import Estimate
-from grounded.diagnosis.validation.certainty import PRIOR_SHARE, information
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -47,10 +42,7 @@ from grounded.task import Task
 from grounded.trial import Trial, scattered
 
 FEW_STEPS = 30
-WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
-DEPENDS = 2.0  # a value depends on held parameters if freeing them widens it by this factor
 SAMPLES = 20  # of the slopes by which inputs are compared
-QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 
 @dataclass(frozen=True)
@@ -354,97 +346,6 @@ def _of_moving(
     return found
 
 
-def identifiable(
-    predictor: Predictor, fit: Fitted, known: Mapping[str, Estimate] | None = None
-) -> list[Identifiable]:
-    """Return how well the trials identify each uncertain parameter, with all others free.
-
-    The whitened sensitivities of the predictions give the Fisher information that the data add to
-    the priors. The verdict depends on the posterior standard deviation relative to the prior's. If
-    a calibrated value states a larger standard deviation, that one is used.
-
-    Parameters that are not identifiable one by one may be so together: the calibrated values differ
-    from nominal in one direction, and if that direction is identifiable, so is what is adopted. So
-    is one that is identifiable if all others are as calibrated: a boat's masses, drags and thrust
-    are known but for one factor of all, and without the thrust the others were worse than nothing.
-
-    Args:
-        predictor: evaluates hypotheses, with all uncertain parameters free.
-        fit: the hypothesis beside which they are identified, and its noise.
-        known: the parameters that were calibrated; the others were held at their values.
-    """
-    information, known = _information(predictor, fit), known or {}
-    precision = information + np.eye(len(information))
-    cov = np.asarray(np.linalg.inv(precision), float)
-    model, found = predictor.data.model, []
-    names = [model.param_names[i] for i in calibrated(predictor.data)]
-    priors = np.array([model.params[name].spread for name in names])
-    jointly = _jointly(cov, names, priors, model, known)
-    held_ = [i for i, name in enumerate(names) if known and name not in known]
-    for i, name in enumerate(names):
-        std = known[name].std if name in known else 0.0
-        share = max(float(np.sqrt(cov[i, i])), min(std / priors[i], 1.0))
-        given = {}
-        if name in known and known[name].value and share > DEPENDS * std / priors[i]:
-            per = cov[i, held_] @ np.linalg.pinv(cov[np.ix_(held_, held_)], hermitian=True)
-            for slope, j in zip(per, held_, strict=True):
-                if slope**2 * cov[j, j] > PRIOR_SHARE * cov[i, i]:
-                    size = model.params[names[j]].value / known[name].value
-                    given[names[j]] = float(slope * priors[i] / priors[j] * size)
-        alone = _verdict(share)
-        with_others = _verdict(float(precision[i, i] ** -0.5)) != "not identifiable"
-        joint = (jointly or with_others) and alone == "not identifiable" and name in known
-        found.append(Identifiable(name, alone, float(priors[i]), share, given, joint))
-    return found
-
-
-def _jointly(
-    cov: Array,
-    names: Sequence[str],
-    priors: Array,
-    model: Model,
-    known: Mapping[str, Estimate],
-) -> bool:
-    """Check whether the data identify the direction in which the parameters were moved.
-
-    Args:
-        cov: posterior covariance (K, K) in units of the priors.
-        names: the uncertain parameters (K).
-        priors: their prior standard deviations (K,).
-        model: holds their nominal values.
-        known: the calibrated values.
-    """
-    off = [known[n].value - model.params[n].value if n in known else 0.0 for n in names]
-    along = np.array(off) / priors
-    size = float(along @ along)
-    return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
-
-
-def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Model:
-    """Return the model with parameters held constant that can't be identified even with less noise.
-
-    If only a combination of several is identifiable (a mass and a gain), the one with the widest
-    relative prior stays free.
-
-    Args:
-        predictor: evaluates hypotheses on the data.
-        fit: the hypothesis beside which they are identified, and its noise.
-        less_noise: factor by which the variance of the noise may still fall.
-    """
-    model = predictor.data.model
-    H = _information(predictor, fit) * less_noise
-    names = [model.param_names[i] for i in calibrated(predictor.data)]
-    sure = np.array([model.params[n].spread / max(abs(model.params[n].value), 1e-9) for n in names])
-    free = list(range(len(names)))
-    while free:
-        left = _left(H[np.ix_(free, free)])
-        lost = [i for i, share in zip(free, left, strict=True) if share > UNKNOWN]
-        if not lost:
-            break
-        free.remove(min(lost, key=lambda i: sure[i]))
-    return model.holding([names[i] for i in range(len(names)) if i not in free])
-
-
 def without_others(data: Data, adopted: Collection[str], library: Library) -> Model:
     """Return the model with the values of adopted effects held that one motion can't determine.
 
@@ -464,26 +365,3 @@ def without_others(data: Data, adopted: Collection[str], library: Library) -> Mo
             effect = library.effect(name, model, data.scales)
             held |= {param_name(name, q.name) for q in effect.quantities}
     return model.holding(held)
-
-
-def _information(predictor: Predictor, fit: Fitted) -> Array:
-    """Return the information on uncertain parameters in units of their priors, (K, K).
-
-    The values of the effects are marginalised, but for a parameter that is off: that is its value.
-    """
-    h, G = fit.hypothesis, information(predictor, fit)
-    k, each = len(h.theta), [effect.name for effect in h.effects for _ in effect.free]
-    others = [i for i, name in enumerate(each) if not name.startswith("parameter:")]
-    across, among = G[k:][:, others], G[np.ix_(others, others)]
-    return np.asarray(G[k:, k:] - across @ np.linalg.pinv(among, hermitian=True) @ across.T)
-
-
-def _left(information: Array) -> Array:
-    """Return posterior standard deviations with unit priors, (K,)."""
-    return np.sqrt(np.diag(np.linalg.inv(information + np.eye(len(information)))))
-
-
-def _verdict(left: float) -> str:
-    if left > UNKNOWN:
-        return "not identifiable"
-    return "weak" if left > WEAK else "identifiable"

@@ -188,7 +188,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {by:.3g} "
         "nats]][[would tell {value} to +- {after:size}]][[ instead of {now:size}]]"
-        "[[ in {runs} runs]][[motion? would show whether the values hold in another motion]]",
+        "[[motion? would show whether the values hold in another motion]]",
     ),
     "no_probe": Entry(
         "note",

@@ -8,7 +8,7 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.validation.certainty import by_priors
+from grounded.diagnosis.validation.identifiable import identified
 from grounded.effects import Library, wrap
 
 DT = 0.05
@@ -101,7 +101,7 @@ def fitted(model):
         h = h.plus(Library().effect(name, model, data.scales), values)
     search = HypothesisSearch(data, ())
     (fit,) = search.refined([search.fresh(h)], TO_THE_TOP)
-    return by_priors(search.predictor, fit), fit
+    return identified(search.predictor, fit), fit
 
 
 def test_the_scale_of_a_planar_arm_rests_on_the_surest_inertia():

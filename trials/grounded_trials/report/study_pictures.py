@@ -142,30 +142,29 @@ def _improvements(result: CarResult, names: Sequence[str]) -> Bars:
 def theorem1_figure(result: Theorem1Result) -> Figure:
     """Draw gradient error and squared gradient over epsilon, log-log, below the theorem's bounds.
 
-    A bound is drawn with the largest K that was measured, and with that of the paper's proof.
+    A bound is drawn with the largest K that was measured.
     """
-    slopes, measured, proof = result.slopes(), result.measured_K, result.proof_K
+    slopes, K = result.slopes(), result.measured_K
     panels = (
         _trend(
             result,
             ("Gradient’s error", "log₁₀ |∇Û − ∇U|"),
             lambda row: row.error,
             slopes["gradient_error"],
-            lambda epsilon, K: K * epsilon,
+            lambda epsilon: K * epsilon,
         ),
         _trend(
             result,
             ("|∇U|² at the end", "log₁₀ |∇U|²"),
             lambda row: row.squared,
             slopes["squared_gradient"],
-            lambda epsilon, K: 2 * (K * epsilon) ** 2,
+            lambda epsilon: 2 * (K * epsilon) ** 2,
         ),
     )
     key = (
         Key("best", "median of the seeds"),
         Key("best", "each seed", "ring"),
-        Key("limit", f"bound with the largest measured K, {measured:.3g}"),
-        Key("model", f"bound with the K of the paper’s proof, {proof:.3g}"),
+        Key("limit", f"bound with the largest measured K, {K:.3g}"),
     )
     return Figure("theorem1", "Theorem 1: a model wrong by epsilon", "", panels, key)
 
@@ -175,12 +174,9 @@ def _trend(
     names: tuple[str, str],
     value: Callable[[Theorem1Row], float],
     slope: tuple[float, float],
-    bound: Callable[[float, float], float],
+    bound: Callable[[float], float],
 ) -> Panel:
-    """Draw a quantity (title, axis) by epsilon: a ring per seed, the median, and its bounds.
-
-    `bound` is a function of epsilon and K.
-    """
+    """Draw a quantity (title, axis) by epsilon: a ring per seed, the median, and its bound."""
     rows = result.rows
     dots = tuple(
         Dot(_log(r.epsilon), _log(value(r)), "best", f"seed {r.seed}: {value(r):.3g}", "ring")
@@ -190,12 +186,9 @@ def _trend(
     groups = [[row for row in rows if row.epsilon == epsilon] for epsilon in epsilons]
     x = np.array([_log(epsilon) for epsilon in epsilons])
     y = np.array([_log(float(np.median([value(row) for row in own]))) for own in groups])
-    curves = [Curve(x, y, "best", "median", 2.0)]
-    for role, K in (("limit", result.measured_K), ("model", result.proof_K)):
-        height = np.array([_log(bound(epsilon, K)) for epsilon in epsilons])
-        if np.isfinite(K):
-            curves.append(Curve(x, height, role, "bound", 1.5))
-    power = round(float(np.log10(bound(10.0, 1.0) / bound(1.0, 1.0))))
+    height = np.array([_log(bound(epsilon)) for epsilon in epsilons])
+    curves = [Curve(x, y, "best", "median", 2.0), Curve(x, height, "limit", "bound", 1.5)]
+    power = round(float(np.log10(bound(10.0) / bound(1.0))))
     error = f" ± {slope[1]:.3f}" if np.isfinite(slope[1]) else ""
     title = f"{names[0]}: slope {slope[0]:.3f}{error}, bound {power}"
     return Panel(title, "log₁₀ epsilon", names[1], tuple(curves), dots)

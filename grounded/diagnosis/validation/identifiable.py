@@ -1,0 +1,242 @@
+"""What the data determine: of each parameter and value, how much, and what only priors set.
+
+With G the information of the data on the values of all effects and on all uncertain parameters,
+these in units of their priors, and P = diag(0, 1) that of the priors,
+
+    C = (G + P)^-1                 variances with the priors
+    sqrt((G^-1)_ii / C_ii)         how much wider value i is without them
+    C_ij^2 / C_ii                  the part of its variance from the prior of parameter j
+
+the last since C = C G C + C P C. The verdict on a parameter is what the data leave of its prior
+standard deviation, sqrt(C_jj). A value *rests on* parameters whose priors make most of its
+variance: in a horizontal plane nothing moves differently if all torques, inertias and frictions are
+larger by one factor. The standard deviation of a gain is then that of a declared inertia, and if a
+part of the inertia is missing in the model, the gain is wrong by many of them. A value that is at
+least ALONE times as wide without the priors would stay where they put it even if one of them were
+wrong by as many standard deviations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from grounded.diagnosis.error_report import Combination, Identifiable
+from grounded.diagnosis.hypotheses.leftover import filter_of
+from grounded.diagnosis.levels import HALF, WELL
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.intervals import fisher
+from grounded.diagnosis.likelihood.linearise import base_columns
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.parts import Estimate
+from grounded.effects import ParamFamily
+from grounded.filter import kalman
+from grounded.frozen import Array
+from grounded.model import Model
+
+WEAK, UNKNOWN = 0.2, 0.6  # remaining fraction of a parameter's prior standard deviation
+ALONE = 5.0  # times as wide without the priors: as many standard deviations may one be wrong
+PRIOR_SHARE = 0.2  # of a value's variance, from which on it rests on a prior
+QUIETER = 100.0  # factor by which effects may still reduce the noise variance
+
+Key = tuple[str, str]  # of a value: effect and quantity, or "" and parameter
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """What the data determine beside a hypothesis.
+
+    Attributes:
+        parameters: each uncertain parameter.
+        combinations: values that show only in combination, with at least one claimed effect that is
+            no parameter itself.
+        std: standard deviations of these under the whole priors [unit of the value].
+    """
+
+    parameters: tuple[Identifiable, ...] = ()
+    combinations: tuple[Combination, ...] = ()
+    std: Mapping[Key, float] = field(default_factory=dict)
+
+
+def identified(
+    predictor: Predictor,
+    fit: Fitted,
+    known: Mapping[str, Estimate] | None = None,
+    *,
+    held_out: bool = True,
+) -> Identified:
+    """Return how well the trials identify each uncertain parameter, and what only priors set.
+
+    If a calibrated value states a larger standard deviation than the information, it is used.
+
+    Parameters that are not identifiable one by one may be so together: the calibrated values differ
+    from nominal in one direction, and if that direction is identifiable, so is what is adopted. So
+    is one that is identifiable if all others are as calibrated: a boat's masses, drags and thrust
+    are known but for one factor of all, and without the thrust the others were worse than nothing.
+
+    Args:
+        predictor: evaluates hypotheses, with all uncertain parameters free.
+        fit: the hypothesis beside which they are identified, and its noise; its parameters may be
+            free, or held.
+        known: the parameters that were calibrated; the others were held at their values.
+        held_out: whether predictions were held out. If not, what is not identifiable alone is not
+            adopted jointly.
+    """
+    model, known = predictor.data.model, known or {}
+    G, keys = _information(predictor, fit)
+    k, names = (
+        sum(bool(effect) for effect, _ in keys),
+        [name for effect, name in keys if not effect],
+    )
+    if not names:
+        return Identified()
+    C = _inverse(G + np.diag([float(not effect) for effect, _ in keys]))
+    priors = np.array([model.params[name].spread for name in names])
+    parts = C[:, k:] ** 2 / np.maximum(np.diag(C), 1e-300)[:, None]
+    parts[parts < PRIOR_SHARE] = 0.0
+    rests = parts.sum(axis=1) > HALF
+
+    # values that stand where the priors put them, in groups
+    unit = np.concatenate([np.ones(k), priors])
+    value, std = _values(fit, predictor, keys) / unit, np.sqrt(np.diag(C))
+    lone = rests & (fisher(G) > ALONE * std) & (std > WELL * np.abs(value))
+    pins = {i: {k + j for j in np.flatnonzero(parts[i]).tolist()} for i in np.flatnonzero(lone)}
+    found, wide = [], dict[Key, float]()
+    for members in _joined(pins):
+        if any(i < k for i in members):
+            on = set.union(*(pins[i] for i in members))
+            told = dict.fromkeys(keys[i][0] or keys[i][1] for i in members if i not in on)
+            found.append(Combination(tuple(told), {keys[j][1]: float(unit[j]) for j in sorted(on)}))
+            wide |= {keys[i]: float(std[i] * unit[i]) for i in members}
+    joint = {name for one in found for name in (*one.values, *one.rests_on)} & known.keys()
+
+    # each parameter: alone, with the others, and what it is given by
+    cov, rows = C[k:, k:], list[Identifiable]()
+    precision = np.linalg.inv(cov)
+    together = _jointly(cov, names, priors, model, known)
+    for i, name in enumerate(names):
+        stated = known[name].std if name in known else 0.0
+        share = max(float(std[k + i]), min(stated / priors[i], 1.0))
+        given = {}
+        if name in known and known[name].value and rests[k + i]:
+            for j in np.flatnonzero(parts[k + i]):
+                if names[j] not in known:
+                    size = model.params[names[j]].value / known[name].value
+                    slope = cov[i, j] / cov[j, j] * priors[i] / priors[j]
+                    given[names[j]] = float(slope * size)
+        alone = _verdict(share)
+        with_others = _verdict(float(precision[i, i] ** -0.5)) != "not identifiable"
+        also = (together or with_others) and alone == "not identifiable" and name in known
+        also = (also or name in joint) and (held_out or alone != "not identifiable")
+        rows.append(Identifiable(name, alone, float(priors[i]), share, given, also))
+    return Identified(tuple(rows), tuple(found), wide)
+
+
+def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Model:
+    """Return the model with parameters held constant that can't be identified even with less noise.
+
+    If only a combination of several is identifiable (a mass and a gain), the one with the widest
+    relative prior stays free.
+
+    Args:
+        predictor: evaluates hypotheses on the data.
+        fit: the hypothesis beside which they are identified, and its noise.
+        less_noise: factor by which the variance of the noise may still fall.
+    """
+    model = predictor.data.model
+    G, keys = _information(predictor, fit)
+    own = [i for i, (effect, _) in enumerate(keys) if effect]
+    free = [i for i, (effect, _) in enumerate(keys) if not effect]
+    sure = {
+        i: model.params[keys[i][1]].spread / max(abs(model.params[keys[i][1]].value), 1e-9)
+        for i in free
+    }
+    names = {keys[i][1] for i in free}
+    while free:
+        some = [*own, *free]
+        prior = np.diag([0.0] * len(own) + [1.0] * len(free))
+        C = _inverse(less_noise * G[np.ix_(some, some)] + prior)
+        left = np.sqrt(np.diag(C))[len(own) :]
+        lost = [i for i, share in zip(free, left, strict=True) if share > UNKNOWN]
+        if not lost:
+            break
+        free.remove(min(lost, key=lambda i: sure[i]))
+    return model.holding(names - {keys[i][1] for i in free})
+
+
+def _information(predictor: Predictor, fit: Fitted) -> tuple[Array, list[Key]]:
+    """Return the data's information on values and uncertain parameters, and their keys.
+
+    The values of the effects come first, without those that are parameters themselves; parameters
+    are in units of their priors.
+    """
+    data, h = predictor.data, fit.hypothesis
+    keys = [(e.name, q.name) for e in h.effects for q in e.free]
+    kept = [not isinstance(e.family, ParamFamily) for e in h.effects for _ in e.free]
+    keys += [("", data.model.param_names[i]) for i in calibrated(data)]
+    free = replace(fit, hypothesis=replace(h, spread=1.0))
+    columns, of_log = base_columns(predictor, free, whole=True)
+    if not columns.shape[-1]:
+        return np.zeros((0, 0)), []
+    white = kalman.innovations(filter_of(predictor, fit), columns, of_log)[0]
+    W = np.nan_to_num(white.reshape(-1, columns.shape[-1]))
+    own = np.flatnonzero([*kept, *[True] * (len(keys) - len(kept))])
+    return np.asarray(W[:, own].T @ W[:, own]), [keys[i] for i in own]
+
+
+def _values(fit: Fitted, predictor: Predictor, keys: Sequence[Key]) -> Array:
+    """Return the values of a fit by key, each in its unit."""
+    h, model = fit.hypothesis, predictor.data.model
+    now = model.values + (0.0 if h.shift is None else h.shift)
+    known = dict(zip((("", name) for name in model.param_names), now, strict=True))
+    for effect, values in h.pairs:
+        known |= {(effect.name, q.name): values[q.name] for q in effect.free}
+    return np.array([known[key] for key in keys])
+
+
+def _inverse(A: Array) -> Array:
+    """Return the pseudo-inverse of a symmetric matrix whose rows may differ much in size."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(A), 1e-300))
+    return np.asarray(np.linalg.pinv(A * np.outer(scale, scale), hermitian=True)) * np.outer(
+        scale, scale
+    )
+
+
+def _joined(pins: Mapping[int, set[int]]) -> Sequence[list[int]]:
+    """Return the values in groups that rest on the same parameters, directly or by others."""
+    groups: list[tuple[set[int], set[int]]] = []
+    for i, own in pins.items():
+        near = [g for g in groups if g[1] & own]
+        groups = [g for g in groups if g not in near]
+        groups.append(({i}.union(*(g[0] for g in near)), own.union(*(g[1] for g in near))))
+    return [sorted(members) for members, _ in groups]
+
+
+def _jointly(
+    cov: Array,
+    names: Sequence[str],
+    priors: Array,
+    model: Model,
+    known: Mapping[str, Estimate],
+) -> bool:
+    """Check whether the data identify the direction in which the parameters were moved.
+
+    Args:
+        cov: posterior covariance (K, K) in units of the priors.
+        names: the uncertain parameters (K).
+        priors: their prior standard deviations (K,).
+        model: holds their nominal values.
+        known: the calibrated values.
+    """
+    off = [known[n].value - model.params[n].value if n in known else 0.0 for n in names]
+    along = np.array(off) / priors
+    size = float(along @ along)
+    return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
+
+
+def _verdict(left: float) -> str:
+    if left > UNKNOWN:
+        return "not identifiable"
+    return "weak" if left > WEAK else "identifiable"
