@@ -137,8 +137,8 @@ def probe(
     second = _adapted(task, latest, second, noise)
     ways = []
     for true, other in ((first, second), (second, first)):
-        runs = (_run(task, true, policy, trial) for trial in latest)
-        ways.append(_Way(task, noise, true, other, [run for run in runs if run is not None]))
+        again = (_run(task, true, policy, trial) for trial in latest)
+        ways.append(_Way(task, noise, true, other, [run for run in again if run is not None]))
     told = ways[0].known * len(trials) / max(len(ways[0].trials), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
     apart = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]

@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.checks import known, list_of, of_shape, refused, same_names, wrong
+from grounded.checks import known, same_names, wrong
 from grounded.frozen import Array, readonly
 from grounded.model import Model
 from grounded.trial import Trial
@@ -142,23 +142,6 @@ def part(record: Record, first: int, last: int) -> Record:
     """Return rows first .. last of a record with all commands (latency needs earlier ones)."""
     rows = slice(first, last + 1)
     return replace(record, times=record.times[rows], measured=record.measured[rows])
-
-
-def records_of(model: Model, trials: Sequence[Trial | Record]) -> list[Record]:
-    """Convert trials to records; records are kept.
-
-    Raises:
-        GroundedError: if there are none, or one does not match the model.
-    """
-    given = [trials] if isinstance(trials, Trial | Record) else trials
-    trials = list_of(given, (Trial, Record), "trials")
-    records = [t if isinstance(t, Record) else record_of(model, t) for t in trials]
-    if not records:
-        raise refused("search.no_trial")
-    for record in records:
-        of_shape("commands of a record", record.commands, (len(record.commands), model.m))
-        of_shape("measured states", record.measured, (len(record.measured), model.n))
-    return records
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Estimate states and noise from stored trials: the public functions of this package.
+"""Estimate states, and the noise of the process, from records: the functions of this package.
 
     x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = x + v,  v ~ N(0, diag(r^2))
     x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);             e_t = y_t - x^-_t
@@ -6,10 +6,10 @@
 of the states that are measured. The extended Kalman filter linearises at each state that it
 reaches; the linear equations are those of `grounded.filter.kalman`, which begin with an identity
 step before the trial. For the noise, the linearisation is fixed while L-BFGS optimises the
-logarithms of the variances (the gradient comes from one pass of the smoother), and renewed between
+logarithms of its variances (the gradient comes from one pass of the smoother), and renewed between
 rounds, since a track that was filtered with the wrong noise is a poor linearisation point. A
-variance without effect on the data (a sensor without noise, a state that is never disturbed) would
-decrease for ever; it stops at a floor far below the visible scatter.
+variance without effect on the data (of a state that is never disturbed) would decrease for ever; it
+stops at a floor far below the visible scatter.
 
 Arrays have time first, (T + 1, B, ...): see `grounded.estimate.record`.
 Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
@@ -22,8 +22,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.checks import of_shape, refused, wrong
-from grounded.estimate.record import Record, RecordBatch, batch_of, records_of
+from grounded.checks import refused, wrong
+from grounded.estimate.record import Record, RecordBatch, batch_of
 from grounded.filter.kalman import (
     Gains,
     LinearSystem,
@@ -36,7 +36,6 @@ from grounded.filter.kalman import (
 )
 from grounded.frozen import Array, readonly
 from grounded.model import Model
-from grounded.trial import Trial
 
 FLOOR = 1e-4  # smallest std, as a fraction of the visible scatter
 ROUNDS = 8  # most linearisations
@@ -73,67 +72,42 @@ class NoiseStd:
 
 
 @dataclass(frozen=True, eq=False)
-class NoiseEstimate:
-    """The estimated noise, its log-likelihood, and how the search ended."""
-
-    noise: NoiseStd
-    loglik: float
-    status: str
-
-
-@dataclass(frozen=True, eq=False)
 class Estimated:
-    """Estimated states of one trial, by the filter or the smoother.
+    """Estimated states of one record, by the filter or the smoother.
 
     `innovations` are the filter's in both cases, whitened; NaN where nothing was measured.
     """
 
-    times: Array  # (T + 1,) [s]
     states: Array  # (T + 1, n)
-    covariance: Array  # (T + 1, n, n)
     innovations: Array  # (T + 1, n)
-    loglik: float  # log-likelihood of this trial's innovations
+    loglik: float  # log-likelihood of this record's innovations
     status: str
 
-    @property
-    def std(self) -> Array:
-        """Standard deviations (T + 1, n)."""
-        diagonal = np.diagonal(self.covariance, axis1=-2, axis2=-1)
-        return np.asarray(np.sqrt(np.maximum(diagonal, 0.0)))
 
-
-def smooth_trials(
+def smoothed(
     model: Model,
-    trials: Sequence[Trial | Record],
+    records: Sequence[Record],
     noise: NoiseStd,
     *,
     latency: Array | None = None,
     forward: bool = False,
 ) -> list[Estimated]:
-    """Estimate the states of each trial with the smoother, from all of its measurements.
+    """Estimate the states of each record with the smoother, from all of its measurements.
 
     For a state that nothing measures, the middle of the disturbance at each instant is returned, so
     that a rate is consistent with its integral (`smooth`).
 
     Args:
         model: n states, m inputs.
-        trials: real trials, or records with separate times of measurements and commands.
-        noise: process and measurement noise, see `noise_of`.
+        records: at least one, all of one step size.
+        noise: process and measurement noise, see `process_noise`.
         latency: transport delay of each input [s], (m,); None for zero.
         forward: use the extended Kalman filter alone, so that each estimate depends only on
             measurements up to its time.
-
-    Raises:
-        GroundedError: if a trial does not match the model.
     """
-    of_shape("process noise", noise.process, (model.n,))
-    of_shape("measurement noise", noise.measurement, (model.n,))
-    records = records_of(model, trials)
     batch = batch_of(records, latency)
     one = filtered(model, batch, noise)
-    x, P = one.x, one.gains.posterior
-    if np.isfinite(one.loglik) and not forward:
-        x, P = smooth(one)
+    x = one.x if forward or not np.isfinite(one.loglik) else smooth(one)
     found = []
     for b, record in enumerate(records):
         rows = slice(0, record.steps + 1)
@@ -141,55 +115,50 @@ def smooth_trials(
         weight = np.maximum(one.gains.weight[rows, b][seen], 1e-300)
         logs = 2 * np.log(weight) - eps[seen] ** 2 - np.log(2 * np.pi)
         loglik = 0.5 * float(logs.sum()) if np.isfinite(one.loglik) else -np.inf
-        white = np.where(seen, eps, np.nan)
-        found.append(Estimated(record.times, x[rows, b], P[rows, b], white, loglik, one.status))
+        found.append(Estimated(x[rows, b], np.where(seen, eps, np.nan), loglik, one.status))
     return found
 
 
-def noise_of(
+def process_noise(
     model: Model,
-    trials: Sequence[Trial | Record],
+    records: Sequence[Record],
+    measurement: Array,
     *,
     latency: Array | None = None,
-    known: Array | None = None,
     sizes: Array | float = 1.0,
-    rng: np.random.Generator | None = None,
-) -> NoiseEstimate:
-    """Estimate process and measurement noise of a model on trials, by maximum likelihood.
+) -> NoiseStd:
+    """Estimate the process noise of a model on records, by maximum likelihood.
 
     Errors of the model count as process noise: fit the model first, or use the process noise as a
     measure of its error.
 
     Args:
         model: n states, m inputs.
-        trials: real trials, or records.
+        records: at least one with more than two samples.
+        measurement: standard deviation of the measurement noise, (n,).
         latency: transport delay of each input [s], (m,); None for zero.
-        known: known measurement noise, (n,); None to estimate it.
         sizes: typical magnitude of the states that nothing measures, (n,) or one number.
-        rng: selects whole trials if there are more than 8,000 samples.
 
     Raises:
-        GroundedError: if a trial does not match the model, or no trial has more than two samples.
+        GroundedError: if no record has more than two samples.
     """
-    records = records_of(model, trials)
-    if max(r.steps for r in records) < 2:
+    if max(record.steps for record in records) < 2:
         raise refused("given.short", what="noise", needs=2)
-    batch = batch_of(_enough(records, rng), latency)
-    start = first_noise(batch, sizes)
-    if known is not None:
-        start = NoiseStd(start.process, known, start.dt)
-    noise, best = start, filtered(model, batch, start)
+    batch = batch_of(_enough(records), latency)
+    visible = first_noise(batch, sizes).process
+    noise = NoiseStd(visible, measurement, batch.dt)
+    best = filtered(model, batch, noise)
     for _ in range(ROUNDS):
         if not np.isfinite(best.loglik):
-            return NoiseEstimate(noise, best.loglik, best.status)
-        trial = _climb(batch, noise, best, start, known is not None)
+            break
+        trial = _climb(batch, noise, best, visible)
         after = filtered(model, batch, trial)
         gain = after.loglik - best.loglik
         if gain > 0:
             noise, best = trial, after
         if not gain > LAST_GAIN:
-            return NoiseEstimate(noise, best.loglik, "converged")
-    return NoiseEstimate(noise, best.loglik, "still rising")
+            break
+    return noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,8 +209,8 @@ def filtered(model: Model, batch: RecordBatch, noise: NoiseStd) -> Filtered:
     return Filtered(x, x_prior, e, eps, g, loglik, status)
 
 
-def smooth(one: Filtered) -> tuple[Array, Array]:
-    """Return the smoothed states (T + 1, B, n) and covariances of a finite pass.
+def smooth(one: Filtered) -> Array:
+    """Return the smoothed states (T + 1, B, n) of a finite pass.
 
     A disturbance acts throughout a step, but the filter adds it at the end of the step. For a state
     that nothing measures this gives a sawtooth: if the model is wrong for some time, each sample is
@@ -249,19 +218,11 @@ def smooth(one: Filtered) -> tuple[Array, Array]:
     middle of the jump is returned for such states, x_t - w_t / 2, with which a rate is consistent
     with its integral (trapezoidal rule).
     """
-    g, P = one.gains, one.gains.P
-    back = smoother(g, one.eps, covariances=True)
-    assert P is not None
-    assert back.whole is not None
-    x, after = one.x_prior + (P @ back.r[..., None])[..., 0], P - P @ back.whole @ P
-    unseen = np.asarray(~(g.system.seen > 0).any(axis=(0, 1)))
-    if unseen.any():
-        half, eye = np.where(unseen, 0.5 * g.system.Q, 0.0), np.eye(P.shape[-1])
-        x = x - half * back.r
-        both = half[..., None] * (eye - back.whole @ P)  # covariance of w_t / 2 and x_t
-        own = half[..., None] * (0.5 * eye - back.whole * half[..., None, :])  # of w_t / 2
-        after = after - (both + both.swapaxes(-1, -2) - own)
-    return x, after
+    g = one.gains
+    assert g.P is not None
+    back, unseen = smoother(g, one.eps), ~(g.system.seen > 0).any(axis=(0, 1))
+    half = np.where(unseen, 0.5 * g.system.Q, 0.0)
+    return np.asarray(one.x_prior + (g.P @ back.r[..., None])[..., 0] - half * back.r)
 
 
 def _system(batch: RecordBatch, noise: NoiseStd, A: Array) -> LinearSystem:
@@ -299,12 +260,10 @@ def relinked(about: Filtered, batch: RecordBatch, noise: NoiseStd) -> tuple[Gain
 
 
 def variance_slopes(g: Gains, eps: Array, batch: RecordBatch, noise: NoiseStd) -> Array:
-    """Return the gradient of the log-likelihood by the log variances, (n + n,)."""
+    """Return the gradient of the log-likelihood by the log variances of the process, (n,)."""
     back = smoother(g, eps)
     state = 0.5 * (back.r**2 - back.N)
-    by_q = state[1:][batch.valid].sum(axis=0) * batch.dt / noise.dt
-    by_r = 0.5 * (back.u**2 - back.D).sum(axis=(0, 1)) + (state[0] * batch.sampled).sum(axis=0)
-    return np.concatenate([by_q * noise.process**2, by_r * noise.measurement**2])
+    return np.asarray(state[1:][batch.valid].sum(axis=0) * noise.process**2 * batch.dt / noise.dt)
 
 
 def first_noise(batch: RecordBatch, sizes: Array | float = 1.0) -> NoiseStd:
@@ -327,46 +286,39 @@ def first_noise(batch: RecordBatch, sizes: Array | float = 1.0) -> NoiseStd:
     return NoiseStd(q, r, batch.dt)
 
 
-def _enough(records: Sequence[Record], rng: np.random.Generator | None) -> list[Record]:
+def _enough(records: Sequence[Record]) -> list[Record]:
     """Return all records, or a random selection with about `ROWS` samples."""
     if sum(r.steps for r in records) <= ROWS:
         return list(records)
-    order = (np.random.default_rng(0) if rng is None else rng).permutation(len(records))
+    order = np.random.default_rng(0).permutation(len(records))
     before = np.cumsum([0, *(records[i].steps for i in order)])[:-1]
     return [records[i] for i, rows in zip(order, before, strict=True) if rows < ROWS]
 
 
-def _climb(
-    batch: RecordBatch, noise: NoiseStd, about: Filtered, start: NoiseStd, held: bool
-) -> NoiseStd:
-    """Return the most likely noise for a fixed linearisation; `held`: measurement noise stays."""
+def _climb(batch: RecordBatch, noise: NoiseStd, about: Filtered, visible: Array) -> NoiseStd:
+    """Return the likeliest process noise for a fixed linearisation; `visible` (n,): a rough one."""
     from scipy.optimize import minimize
 
-    n, dt = len(noise.process), noise.dt
+    def there(theta: Array) -> NoiseStd:
+        return NoiseStd(np.exp(0.5 * theta), noise.measurement, noise.dt)
 
     def cost(theta: Array) -> tuple[float, Array]:
-        std = np.exp(0.5 * theta)
-        there = NoiseStd(std[:n], std[n:], dt)
         try:
-            g, eps, loglik = relinked(about, batch, there)
+            g, eps, loglik = relinked(about, batch, there(theta))
         except np.linalg.LinAlgError:
-            return 1e12, np.zeros_like(theta)
+            loglik = -np.inf
         if not np.isfinite(loglik):
             return 1e12, np.zeros_like(theta)
-        slope = variance_slopes(g, eps, batch, there)
+        slope = variance_slopes(g, eps, batch, there(theta))
         return -loglik / batch.count, -slope / batch.count
 
-    visible = np.concatenate([start.process, start.measurement])
-    theta = 2 * np.log(np.concatenate([noise.process, noise.measurement]))
+    theta = 2 * np.log(noise.process)
     low = np.maximum(2 * np.log(FLOOR * visible), theta - TRUSTED)
     high = np.minimum(2 * np.log(1e4 * visible), theta + TRUSTED)
-    if held:
-        low[n:] = high[n:] = theta[n:]
     bounds = list(zip(low, high, strict=True))
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
-    found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options).x
-    std = np.exp(0.5 * found)
-    return NoiseStd(std[:n], std[n:], dt)
+    found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+    return there(found.x)
 
 
 def _spread(values: Array) -> float:

@@ -23,7 +23,7 @@ multivariate state space models"): with u and q its adjoints and D, N their cova
     u = (eps - k'q) / sqrt(s),  q += h'u,  N = (1 - K h)' N (1 - K h) + h'h / s   channels back
     d loglik / dR = (u^2 - D) / 2,     d loglik / dQ = (q^2 - N) / 2;     q = A'q,  N = A'N A
 
-and the smoothed state is x + P q, with covariance P - P N P, x and P as predicted.
+and the smoothed state is x + P q, x and P as predicted.
 
 Arrays are time-major: L steps, B runs, N states, n channels, C columns. Row 0 of `r` and `seen` is
 the state's start; A, Q lead from row t to row t + 1, where the next measurement is.
@@ -261,7 +261,6 @@ class Adjoint:
     D: Array
     r: Array
     N: Array
-    whole: Array | None = None  # (L, B, N, N) all of N, where asked for
 
     def parts(self, runs: int) -> list[Adjoint]:
         """Cut along the runs, `runs` to each part."""
@@ -269,24 +268,23 @@ class Adjoint:
         return [Adjoint(self.u[:, c], self.D[:, c], self.r[:, c], self.N[:, c]) for c in cuts]
 
 
-def smoother(g: Gains, white: Array, *, covariances: bool = False) -> Adjoint:
+def smoother(g: Gains, white: Array) -> Adjoint:
     """The backward pass for one column of whitened innovations, (L, B, n)."""
     if g.delayed is None:
-        return _smoother(g, white, covariances)
+        return _smoother(g, white)
     n, delayed = white.shape[-1], g.delayed
-    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, delayed.count)]), covariances)
+    found = _smoother(g, np.pad(white, [(0, 0), (0, 0), (0, delayed.count)]))
     r, N = delayed.disturbances(found.r, n), delayed.disturbances(found.N, n)
     return Adjoint(found.u[..., :n], found.D[..., :n], r, N)
 
 
-def _smoother(g: Gains, white: Array, covariances: bool) -> Adjoint:
+def _smoother(g: Gains, white: Array) -> Adjoint:
     (L, B, n, N), G = g.k.shape, g.system.G
     found = Adjoint(
         np.empty((L, B, n)),
         np.empty((L, B, n)),
         np.empty((L, B, N)),
         np.empty((L, B, N)),
-        np.empty((L, B, N, N)) if covariances else None,
     )
     if kernels.available(n, N):
         values: dict[str, Any] = {"A": g.system.A, "G": G, "k": g.k}
@@ -304,8 +302,6 @@ def _smoother(g: Gains, white: Array, covariances: bool) -> Adjoint:
         found.D[t] = np.einsum("bii->bi", Wt @ W[t] + Kt @ Nq @ K) * seen
         q = q + Ht @ u
         Nq = kept.swapaxes(1, 2) @ Nq @ kept + Ht @ Wt @ W[t] @ H[t]
-        if found.whole is not None:
-            found.whole[t] = Nq
         found.r[t], found.N[t] = q[..., 0], np.einsum("bii->bi", Nq)
         if G is not None:
             Gt = G[t].swapaxes(1, 2)

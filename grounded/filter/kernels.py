@@ -27,7 +27,7 @@ _LOCK = threading.Lock()
 NAMES = {
     "gains": ("A", "Q", "R", "seen", "start", "G", "L", "B", "k", "weight", "P"),
     "innovations": ("A", "k", "weight", "d", "r", "x", "L", "B", "blocks", "out", "track"),
-    "smoother": ("A", "G", "k", "weight", "white", "L", "B", "u", "D", "r", "N", "whole"),
+    "smoother": ("A", "G", "k", "weight", "white", "L", "B", "u", "D", "r", "N"),
 }
 
 
@@ -223,8 +223,6 @@ class _Smoother(Pass):
                     self._channel(c, q, P, room, (u, D, spare))
                 self.scatter(u, "u", t, n)
                 self.scatter(D, "D", t, n)
-                with f.when(self.wanted("whole")):
-                    self.scatter(P, "whole", t, N * N)
                 if self.through:
                     self._leaves(room["G"], q, P, (answer, spare))
                     self.scatter(answer, "r", t, N)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from grounded.estimate import Record, noise_of, smooth_trials
+from grounded.estimate import Record, process_noise, smoothed
 from grounded.model import Model, Param
 
 BOOM = Model(
@@ -37,7 +37,7 @@ def test_a_rate_fits_the_slope_of_its_angle_where_the_model_is_off(tau, rms):
         np.array([3e-4, 1.0]),
         np.array([1.0, 0.5]),
     )
-    noise = noise_of(crude, [record], known=known, sizes=sizes).noise
-    found = smooth_trials(crude, [record], noise)[0].states[:, 1]
+    noise = process_noise(crude, [record], known, sizes=sizes)
+    found = smoothed(crude, [record], noise)[0].states[:, 1]
     assert np.mean(found[1:] + found[:-1]) / 2 == pytest.approx((th[-1] - th[0]) / 3, abs=5e-4)
     assert np.sqrt(np.mean((found - w) ** 2)) < rms

@@ -102,7 +102,9 @@ def identified(
     unit = np.concatenate([np.ones(k), priors])
     value, std = _values(fit, predictor, keys) / unit, np.sqrt(np.diag(C))
     lone = rests & (fisher(G) > ALONE * std) & (std > WELL * np.abs(value))
-    pins = {i: {k + j for j in np.flatnonzero(parts[i]).tolist()} for i in np.flatnonzero(lone)}
+    pins = {
+        i: {k + j for j in np.flatnonzero(parts[i]).tolist()} for i in np.flatnonzero(lone).tolist()
+    }
     found, wide = [], dict[Key, float]()
     for members in _joined(pins):
         if any(i < k for i in members):

@@ -12,8 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.estimate import NoiseStd, first_noise, record_of, smooth_trials
-from grounded.estimate.record import batch_of
+from grounded.estimate import NoiseStd, batch_of, first_noise, record_of, smoothed
 from grounded.frozen import Array
 from grounded.places import true_values
 from grounded.rollout import augmented
@@ -108,7 +107,7 @@ def _known(planner: Planner, trial: Trial) -> Trial:
     for memory, log in behind.items():
         known[memory] = known[log]
     noise = NoiseStd(noise.process, known, noise.dt)
-    [found] = smooth_trials(model, [logged], noise, latency=latency, forward=True)
+    [found] = smoothed(model, [logged], noise, latency=latency, forward=True)
     states = np.array(lifted.states)
     states[:, list(behind)] = found.states[:, list(behind)]
     return replace(lifted, states=states) if np.isfinite(states).all() else lifted

@@ -226,7 +226,7 @@ def _smoothed(
     records: list[Record], table: EstimateTable, task: Task, sizes: Array
 ) -> tuple[Array, Array]:
     """Smooth records; return the times, (N,) [s], and the states, (N, n)."""
-    from grounded.estimate import NoiseStd, noise_of, smooth_trials
+    from grounded.estimate import NoiseStd, process_noise, smoothed
 
     model, late = task.model, task.latency
     known = np.array([table.measured.get(name, 1.0) for name in model.state_names])
@@ -234,11 +234,11 @@ def _smoothed(
     records = [replace(record, start_std=START_SPREAD * sizes) for record in records]
 
     def fitted(records: list[Record]) -> NoiseStd:
-        found = noise_of(model, _moving(records), latency=late, known=known, sizes=sizes)
-        process = np.array(found.noise.process)
+        found = process_noise(model, _moving(records), known, latency=late, sizes=sizes)
+        process = np.array(found.process)
         for name, std in table.process.items():
-            process[model.state_names.index(name)] = std * np.sqrt(found.noise.dt / task.dt)
-        return NoiseStd(process=process, measurement=known, dt=found.noise.dt)
+            process[model.state_names.index(name)] = std * np.sqrt(found.dt / task.dt)
+        return NoiseStd(process, known, found.dt)
 
     noise = fitted(records)
     parts = [one for record in records for one in _overlapping(record)]
@@ -248,20 +248,19 @@ def _smoothed(
         held = replace(first, past=task.past)
         std = np.where(guessed, WAITING_SPREAD, START_SPREAD) * sizes
         rivals = [first, held, replace(held, start=task.start, start_std=std)]
-        likely = [one.loglik for one in smooth_trials(model, rivals, noise, latency=late)]
+        likely = [one.loglik for one in smoothed(model, rivals, noise, latency=late)]
         if likeliest := int(np.argmax(np.nan_to_num(likely, nan=-np.inf))):
             records = [replace(one, past=task.past) for one in records]
             noise = fitted(records)
             parts = [one for record in records for one in _overlapping(record)]
             parts[0] = rivals[likeliest], core
-    smooth = smooth_trials(model, [one for one, _ in parts], noise, latency=late)
-    kept = [one.states[core] for one, (_, core) in zip(smooth, parts, strict=True)]
-    states = np.concatenate(kept)
+    smooth = smoothed(model, [one for one, _ in parts], noise, latency=late)
+    states = np.concatenate(
+        [one.states[core] for one, (_, core) in zip(smooth, parts, strict=True)]
+    )
     if not np.isfinite(states).all():
         raise refused("log.not_estimated", why=str(smooth[0].status))
-    return np.concatenate(
-        [one.times[core] for one, (_, core) in zip(smooth, parts, strict=True)]
-    ), states
+    return np.concatenate([piece.times[core] for piece, core in parts]), states
 
 
 def _complete(piece: Record, record: Record) -> bool:
