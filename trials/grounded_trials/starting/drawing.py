@@ -35,7 +35,6 @@ from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import figure, misread
 from grounded_trials.workspace.candidates.at_rest import (
-    NOISY,
     Rest,
     read_at_start,
     rest_at_end,
@@ -45,9 +44,9 @@ from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import refuse_ids, unknown_trial
 from grounded_trials.workspace.new_target import replace_target
-from grounded_trials.workspace.off_target import driven, usual_weights
+from grounded_trials.workspace.off_target import driven
 from grounded_trials.workspace.user_files.config import TaskTable, set_numbers
-from grounded_trials.workspace.user_files.task_file import read_target, seen_in, without_range
+from grounded_trials.workspace.user_files.task_file import read_target, seen_in
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
@@ -106,7 +105,6 @@ def _holds(table: Path, mapping: LogMapping) -> bool:
 
 
 SECONDS = 5.0  # default duration of a step or a swing-up
-REACHED = 0.95  # of the speed asked for: a path that stays below it brings a note
 STRAIGHT = 1e3  # times its size: larger turning radii are those of a straight line
 OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
@@ -195,9 +193,7 @@ class _Case:
     asked: Manoeuvre
     columns: Mapping[str, Array]
     free: Sequence[str]
-    fastest: float  # [m/s] along a path, NaN if it is none
-    line: Rest | None  # what lets the free states of a line rest at its end
-    rests: Rest | None  # the same, if it was asked for
+    may_rest: Rest | None  # what would let the free states of a line rest at its end
     begins: Mapping[str, float]  # what is new in [task] start
     seen: str  # the trial that rests there
     ran: bool  # whether there are candidates for the target before
@@ -248,9 +244,8 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     free = tuple(name for name in model.states if name not in columns)
     planar = asked.is_path and has_plane(model)
     along = driven(model, columns, old.dt) if planar else (math.nan, math.inf)
-    case = _Case(
-        workspace, asked, columns, free, along[0], line, rests, rest, seen, ran, old, before, reward
-    )
+    offered = line if rests is None else None
+    case = _Case(workspace, asked, columns, free, offered, rest, seen, ran, old, before, reward)
     return Drawn(
         path,
         columns,
@@ -290,15 +285,6 @@ def _reward(workspace: Folder) -> Weights:
 # What is told
 
 
-def _slower(case: _Case) -> Iterator[Finding]:
-    asked, drive = case.asked.paces.get("speed"), case.asked.drive
-    if asked is not None and not case.asked.to and case.fastest < REACHED * asked:
-        fastest = Quantity(case.fastest, "m/s")
-        yield found(
-            "target.slower", fastest=fastest, asked=asked, accel=drive.accel, lateral=drive.lateral
-        )
-
-
 def _in_degrees(case: _Case) -> Iterator[Finding]:
     given, columns = case.asked.to, {} if case.asked.is_path else case.columns
     largest = {name: max(column, key=abs) for name, column in columns.items()} | dict(given)
@@ -314,15 +300,15 @@ def _weighed_without_column(case: _Case) -> Iterator[Finding]:
     kinds = (case.reward.get(kind, {}) for kind in ("state", "terminal"))
     weighed = {name for kind in kinds for name, weight in kind.items() if weight}
     if about := [name for name in case.free if name in weighed]:
-        rates = velocities(case.workspace.base_model) if case.line else ()
+        rates = velocities(case.workspace.base_model) if case.asked.shape == "line" else ()
         to = " ".join(f"--to {name}={'0' if name in rates else 'VALUE'}" for name in about)
         path = case.asked.is_path and not case.asked.to
         yield found("given.unweighed", *about, to=None if path else to, weight=Weight.WARN)
 
 
 def _rest(case: _Case) -> Iterator[Finding]:
-    if case.line is not None and case.rests is None:
-        ends = {name: column[-1] + 0.0 for name, column in case.line.columns.items()}
+    if case.may_rest is not None:
+        ends = {name: column[-1] + 0.0 for name, column in case.may_rest.columns.items()}
         yield found("target.may_rest", *(f"{name} = {end:.3g}" for name, end in ends.items()))
 
 
@@ -341,23 +327,6 @@ def _replaced(case: _Case) -> Iterator[Finding]:
 def _begins(case: _Case) -> Iterator[Finding]:
     if case.begins:
         yield found("target.start", case.seen, start=_equal(case.begins))
-
-
-def _kept_weights(case: _Case) -> Iterator[Finding]:
-    ended = {} if case.rests is None else case.rests.columns
-    each = usual_weights(case.workspace.base_model, case.columns)
-    usual = {name: float(f"{w:.6g}") for name, w in each.items() if name not in ended}
-    weights = case.reward.get("state", {})
-    if weights and weights == case.before.get("state", {}) and weights != usual:
-        yield found("target.kept", weights=_equal(weights), usual=_equal(usual))
-
-
-def _noisy_end(case: _Case) -> Iterator[Finding]:
-    for name, noise in (case.rests.noise if case.rests else {}).items():
-        weight = case.reward["terminal"][name]
-        if case.rests and weight == case.rests.weights[name]:  # else it is the user's own
-            noise_ = Quantity(noise, case.units[name])
-            yield found("target.noisy_end", name, least=weight, noise=noise_, cost=NOISY)
 
 
 def _beyond_safety(case: _Case) -> Iterator[Finding]:
@@ -389,13 +358,6 @@ def _in_readings(case: _Case) -> Iterator[Finding]:
             yield found("target.readings", name, bias=misread(b, unit), end=off[0], start=off[1])
 
 
-def _still(case: _Case) -> Iterator[Finding]:
-    ended = {} if case.rests is None else case.rests.columns
-    still = [name for name in without_range(case.columns, case.units) if name not in ended]
-    if still:
-        yield found("target.still", *still)
-
-
 def _of_log(case: _Case) -> Iterator[Finding]:
     if log := seen_in(case.workspace.config):
         yield found("plan.limits_of_log", log=log)
@@ -414,10 +376,6 @@ TOLD = (
     _beyond_safety,
     _in_readings,
     _begins,
-    _slower,
     _rest,
-    _kept_weights,
-    _still,
-    _noisy_end,
     _replaced,
 )
