@@ -40,6 +40,7 @@ from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.interval import interval_of, too_coarse
 from grounded_trials.starting.kinds import (
     KINDS,
+    Clues,
     by_encoders,
     kind_in,
     moving,
@@ -185,14 +186,15 @@ def _begin(
 ) -> Begun:
     # What the log has, and the model: the user's, or a skeleton of the kind of robot.
     files, report, notes = _usable(log, layout)
-    drawn = _Draft(folder, report, joint_names(report), column_units(files[0]), own, named)
+    clues = Clues(report, joint_names(report), column_units(files[0]))
+    drawn = _Draft(folder, report, clues, own, named)
     drawn.begin(kind)
 
     # Which number is which signal, and in which units.
     units = {**drawn.model.states, **drawn.model.inputs}
     states, inputs = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
     drawn.with_gain((*states, *inputs))
-    odd = perhaps_degrees((*states, *inputs), drawn.model, drawn.joints)
+    odd = perhaps_degrees((*states, *inputs), drawn.model, clues.joints)
     inputs = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs]
     slow = () if layout.rate or about_table(files[0]).in_time_units else _in_seconds(report)
 
@@ -237,8 +239,7 @@ class _Draft:
 
     folder: Path
     report: LogReport
-    joints: Mapping[str, tuple[str, ...]]
-    stated: Mapping[str, str]  # units of columns by path
+    clues: Clues
     own: OwnModel | None
     named: Sequence[str]  # inputs of a generic skeleton
     kind: str = ""
@@ -250,19 +251,19 @@ class _Draft:
 
     def begin(self, kind: str) -> None:
         """Take the user's model, or a skeleton: the kind's if it has a state of the log."""
-        self.kind, self.why = (kind, "--kind") if kind else kind_in(self.report, self.joints)
+        self.kind, self.why = (kind, "--kind") if kind else kind_in(self.clues)
         if self.own:
             self.model, self.why = self.own.bring(self.folder), "your model"
             self._match()
             return
-        self._take(skeleton(self.kind, self.report, self.joints, self.named, self.stated))
+        self._take(skeleton(self.kind, self.clues, self.named))
         if not (kind or any(g.path for g in self.matched[0])):
             self.kind, self.why = "generic", f"none of {self.kind}"
-            self._take(skeleton("generic", self.report, self.joints, self.named, self.stated))
+            self._take(skeleton("generic", self.clues, self.named))
         if self.kind == "balance":
             states, inputs = self.matched
             wheel = self.model.params["r"].value
-            self.matched = by_encoders(states, self.report, self.joints, wheel), inputs
+            self.matched = by_encoders(states, self.clues, wheel), inputs
 
     def with_gain(self, signals: Sequence[Guess]) -> None:
         """Write the gain that the log shows into a skeleton that has one."""
@@ -273,7 +274,7 @@ class _Draft:
 
     def _take(self, plain: Skeleton) -> None:
         self._write(plain)
-        numbers = moving(self.report)
+        numbers = self.clues.found
         if self.kind != "generic":
             self._match()
             return
@@ -291,7 +292,9 @@ class _Draft:
 
     def _match(self, given: Mapping[str, str] = MappingProxyType({})) -> None:
         model = self.model
-        self.matched = assigned(self.report, model.states, model.inputs, model, self.joints, given)
+        self.matched = assigned(
+            self.report, model.states, model.inputs, model, self.clues.joints, given
+        )
 
     def _write(self, plain: Skeleton) -> None:
         """Write a skeleton as model.py and load it."""

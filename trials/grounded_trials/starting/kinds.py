@@ -7,13 +7,13 @@ bounds on the parameters. Users are expected to edit it.
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from grounded.checks import refused, unknown
 from grounded.findings import found as found_
 from grounded.units import factor_between
 from grounded_trials.logs.inspection.guess import Guess
-from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, TopicReport
+from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
 from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
 from grounded_trials.logs.inspection.relations import Signals
@@ -54,6 +54,7 @@ AFLOAT = re.compile(r"thruster|propeller|(^|[/._])(usv|wamv|boat|vessel)([/._\d]
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
+LIFTED = "thrust(?!er)|attitude_setpoint|actuator_outputs"
 
 
 def moving(log: LogReport) -> dict[str, FieldReport]:
@@ -91,7 +92,7 @@ def called_input(name: str, path: str, beside: Collection[str]) -> bool:
     return speaks_for > surge + 2 * bool(DONE.search(path))
 
 
-def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = None) -> Skeleton:
+def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     """Return a skeleton for any robot, with the numbers of the log as states and inputs.
 
     A state whose rate is another state gets that as its derivative; every other state follows the
@@ -101,20 +102,19 @@ def generic(log: LogReport, inputs: Sequence[str] = (), units: Units | None = No
     those named after an actuator, else forces, torques and voltages.
 
     Args:
-        log: the log.
+        clues: of the log.
         inputs: names of the numbers that are inputs, in order; empty: guessed as above.
-        units: units by path, where the log states them.
 
     Raises:
         GroundedError: for an input that the log does not have.
     """
-    found, known = moving(log), units or {}
+    log, found, known = clues.log, clues.found, clues.units
     unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
     for name in (one for one in inputs if one not in found):
         if any(_word(one.path) == name for one in log.numbers):
             raise refused("start.still", name)
         raise unknown("number", name, found, "the log")
-    called = [n for n in reversed(found) if called_input(n, found[n].path, found)]
+    called = [*clues.sent][::-1]
     followers = _followers(found, list(inputs) or called)
     inputs = inputs or list(followers.values())[:MOST_STATES] or _inputs_in(found, called, unit)
 
@@ -206,250 +206,228 @@ def _word(path: str) -> str:
     return name if name.isidentifier() else f"s_{name}"
 
 
-KINDS = (
-    "car",
-    "rover",
-    "differential",
-    "boat",
-    "balance",
-    "drone",
-    "arm",
-    "pendulum",
-    "crane",
-    "generic",
-)
+class Clues:
+    """What in a log shows the kind of robot.
 
+    Args:
+        log: an inspected log.
+        joints: names of its joints by topic, see `joint_names`.
+        units: units by path, where the log states them.
+    """
 
-def kind_in(log: LogReport, joints: Joints) -> tuple[str, str]:
-    """Return the kind of robot that a log was probably recorded on, and the names that show it."""
-    steered = next((t.topic for t in log.topics if "Ackermann" in t.type), None)
-    if steered is not None:
-        return "car", steered
-    if hung := _hung(log, joints):
-        return "crane", hung
-    if joints := _turning(of_arms(at_joints(joints))):
-        where, names = next(iter(joints.items()))
-        kind = "arm" if len(names) > 1 else "pendulum"
-        return kind, f"{where}: {', '.join(names[:6])}"
-    flying = next((t.topic for t in log.topics if FLYING.search(t.topic.lower())), None)
-    if flying is not None:
-        return "drone", flying
-    both = _both_sides(log)
-    afloat = [t for t in log.topics if AFLOAT.search(t.topic.lower())]
-    pairs = both or next(filter(None, map(_two_unnamed, afloat)), ())
-    if afloat and pairs and (both or _headed(log)):
-        return "boat", ", ".join((afloat[0].topic, *pairs))
-    for wanted, kind in (
-        (("steer",), "car"),
-        (("thrust(?!er)", "attitude_setpoint", "actuator_outputs"), "drone"),
-        (("cmd_vel",), "rover"),
-    ):
-        for topic in log.topics:
-            if _says(topic, wanted):
-                return kind, topic.topic
-    words = {_word(one.path).lower() for one in log.numbers}
-    if both:
-        return "differential", ", ".join(both)
-    if sent := _speed_and_turn(log):
-        return "rover", ", ".join(sent)
-    if command := _balancing(log):
-        return "balance", command
-    if words & {"theta", "angle", "q", "q_rad", "position"} and words & {"torque", "tau", "u"}:
-        return "pendulum", ", ".join(sorted(words))
-    if flat := next((t.topic for t in log.topics if _in_the_plane(t)), None):
-        return "rover", flat
-    return "generic", "--kind names another"
+    def __init__(self, log: LogReport, joints: Joints, units: Units | None = None) -> None:
+        self.log, self.joints, self.units = log, joints, units or {}
+        self.found = moving(log)
+        self.sent = {  # the paths of the numbers that are named like commands
+            name: one.path
+            for name, one in self.found.items()
+            if called_input(name, one.path, self.found)
+        }
+        self.headed = any(HEADING.search(path.lower()) for path in log.moving)
 
-
-def of_arms(joints: Joints) -> Joints:
-    """Return the topics whose joints are not all wheels."""
-    return {
-        topic: names
-        for topic, names in joints.items()
-        if not all("wheel" in name.lower() for name in names)
-    }
-
-
-def _turning(joints: Joints) -> Joints:
-    """Return the topics whose joints do not all slide: slides alone form no arm or pendulum."""
-    return {topic: names for topic, names in joints.items() if not all(map(slides, names))}
-
-
-def _hung(log: LogReport, joints: Joints) -> str:
-    """Return the evidence that a load or pole swings on a trolley, "" if there is none."""
-    own = [(topic, names) for topic, names in joints.items() if sum(map(slides, names)) == 1]
-    driving = ("/Odometry", "/Twist", "/TwistStamped")
-    if not own or any(t.type.endswith(driving) for t in log.topics):
+    def topic(self, pattern: str | re.Pattern[str], *, fields: bool = False) -> str:
+        """Return the first topic named like that, or with such a field; "" for none."""
+        for topic in self.log.topics:
+            names = [topic.topic, *(one.path for one in topic.fields if fields)]
+            if re.search(pattern, " ".join(names).lower()):
+                return topic.topic
         return ""
-    (topic, names), found = own[0], moving(log)
-    slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
-    if len(others) == 1:
-        return f"{topic}: {slide}, {others[0]}"
-    angles = [
-        n for n, one in found.items() if SWINGS.search(n) and not called_input(n, one.path, found)
-    ]
-    if others or not angles:
-        return ""
-    return f"{topic}: {slide}, {found[angles[0]].path}"
 
+    @property
+    def ackermann(self) -> str:
+        """The topic of a car's commands in ROS."""
+        return next((t.topic for t in self.log.topics if "Ackermann" in t.type), "")
 
-def _crane(log: LogReport, units: Units) -> Skeleton:
-    """Return the crane skeleton with the log's command; unless it is a force, in V or unitless."""
-    sent, plain = sent_in(log), fixed("crane")
-    if len(sent) != 1 or {*sent} <= {*plain.inputs}:
-        return plain
-    ((name, path),) = sent.items()
-    unit = "V" if command_unit(name, path, units).endswith("V") else "1"
-    gain = plain.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
-    return driven_by(plain, {"force": (name, unit)}, gain=gain)
+    @property
+    def arms(self) -> Joints:
+        """The topics whose joints are not all wheels."""
+        return {t: n for t, n in self.joints.items() if not all("wheel" in j.lower() for j in n)}
 
+    def turning(self, several: bool) -> str:
+        """Return the joints that turn, several of an arm or the one of a pendulum."""
+        arms = {t: n for t, n in at_joints(self.arms).items() if not all(map(slides, n))}
+        where, names = next(iter(arms.items()), ("", ()))
+        return f"{where}: {', '.join(names[:6])}" if where and several == (len(names) > 1) else ""
 
-def _headed(log: LogReport) -> bool:
-    """Return whether a log has a heading that changes."""
-    return any(HEADING.search(path.lower()) for path in log.moving)
+    @property
+    def hung(self) -> str:
+        """A trolley, and the load or pole that swings on it."""
+        own = [one for one in self.joints.items() if sum(map(slides, one[1])) == 1]
+        driving = ("/Odometry", "/Twist", "/TwistStamped")
+        if not own or any(t.type.endswith(driving) for t in self.log.topics):
+            return ""
+        topic, names = own[0]
+        slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
+        swings = (one.path for n, one in self.found.items() if SWINGS.search(n))
+        angles = others or [path for path in swings if path not in self.sent.values()]
+        return f"{topic}: {slide}, {angles[0]}" if angles and len(others) < 2 else ""
 
-
-def _two_unnamed(topic: TopicReport) -> tuple[str, ...]:
-    """Return the two changing numbers of a topic that is an unnamed array; else ()."""
-    found = tuple(f.path for f in topic.fields if f.low != f.high)
-    return found if len(found) == 2 and all(f.endswith("]") for f in found) else ()
-
-
-def _both_sides(log: LogReport) -> tuple[str, ...]:
-    """Return the names of a left and a right command; () without both, or without a heading."""
-    paths = {*log.moving}
-    if not _headed(log):
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The names of a left and a right command; () without both, or without a heading."""
+        paths = {*self.log.moving} if self.headed else set[str]()
+        for left in sorted(paths):
+            right = re.sub("left|Left|LEFT", lambda m: OTHER[m[0]], left)
+            if right == left or right not in paths or SENSED.search(left.lower()):
+                continue
+            names = _word(left), _word(right)
+            if names[0] != names[1]:
+                return names
+            if COMMANDED.search(left.lower()) or EFFORT.search(left.lower()):  # /left/thrust
+                return "left", "right"
         return ()
-    for left in sorted(paths):
-        right = re.sub("left|Left|LEFT", lambda m: OTHER[m[0]], left)
-        if right == left or right not in paths or SENSED.search(left.lower()):
-            continue
-        names = _word(left), _word(right)
-        if names[0] != names[1]:
-            return names
-        if COMMANDED.search(left.lower()) or EFFORT.search(left.lower()):  # /left/thrust
-            return "left", "right"
-    return ()
 
+    @property
+    def afloat(self) -> str:
+        """The topic of a boat, and its two thrusters, which may be an array without names."""
+        afloat = [t for t in self.log.topics if AFLOAT.search(t.topic.lower())]
+        arrays = ([f.path for f in t.fields if f.low != f.high] for t in afloat * self.headed)
+        two = (a for a in arrays if len(a) == 2 and all(path.endswith("]") for path in a))
+        both = self.sides or tuple(next(two, ()))
+        return ", ".join((afloat[0].topic, *both)) if afloat and both else ""
 
-def _speed_and_turn(log: LogReport) -> tuple[str, ...]:
-    """Return the names of a speed command and of a turn rate command; () without a heading."""
-    sent = {bare_command(path).rpartition(".")[2].lower(): n for n, path in sent_in(log).items()}
-    pairs = [(sent.get(v, ""), sent.get(w, "")) for v in SPEEDS for w in TURNS]
-    return next((pair for pair in pairs if all(pair)), ()) if _headed(log) else ()
+    @property
+    def speed_and_turn(self) -> str:
+        """A speed command and a turn rate command beside a heading."""
+        sent = {bare_command(p).rpartition(".")[2].lower(): n for n, p in self.sent.items()}
+        pairs = [(sent[v], sent[w]) for v in SPEEDS for w in TURNS if {v, w} <= sent.keys()]
+        return ", ".join(pairs[0]) if pairs and self.headed else ""
 
+    @property
+    def balancing(self) -> str:
+        """The command of a robot balancing on two wheels."""
+        words = {word for name in self.found for word in (name.lower(), *name.lower().split("_"))}
+        rolls = bool(words & PITCHES and words & ROLLS_ON and not words & FLIES)
+        return next(iter(self.sent), "") if rolls and len(self.sent) == 1 else ""
 
-def _balancing(log: LogReport) -> str:
-    """Return the command of a robot balancing on two wheels, "" if the log is of another kind."""
-    found = moving(log)
-    words = {word for name in found for word in (name.lower(), *name.lower().split("_"))}
-    if not words & PITCHES or not words & ROLLS_ON or words & FLIES:
+    @property
+    def angle_and_torque(self) -> str:
+        """The names of one joint."""
+        words = {_word(one.path).lower() for one in self.log.numbers}
+        angle, torque = words & {"theta", "angle", "q", "q_rad", "position"}, {"torque", "tau", "u"}
+        return ", ".join(sorted(words)) if angle and words & torque else ""
+
+    @property
+    def flat(self) -> str:
+        """Odometry of a robot that moves neither up nor sideways."""
+        still = ("position.z", "linear.y", "linear.z")
+        for topic in self.log.topics:
+            fields = [one for one in topic.fields if one.path.endswith(still)]
+            odometry = topic.type.endswith("/Odometry") and topic.messages > 2
+            if odometry and len(fields) == 3 and all(one.low == one.high for one in fields):
+                return topic.topic
         return ""
-    sent = [*sent_in(log)]
-    return sent[0] if len(sent) == 1 else ""
+
+    @property
+    def encoders(self) -> str:
+        """The JointState topic whose joints are all wheels, "" if positions come with it."""
+        driven = any(
+            one.path.endswith(("position.x", "twist.linear.x")) and one.low != one.high
+            for topic in self.log.topics
+            if topic.type.endswith(("/Odometry", *POSES))
+            for one in topic.fields
+        )
+        wheels = (t for t in self.joints if t not in self.arms)
+        turned = (t for t in wheels if f"{t}.position[0]" in self.log.moving)
+        return "" if driven else next(turned, "")
 
 
-def encoders(log: LogReport, joints: Joints) -> str:
-    """Return the JointState topic whose joints are all wheels, "" if positions come with it."""
-    driven = any(
-        one.path.endswith(("position.x", "twist.linear.x")) and one.low != one.high
-        for topic in log.topics
-        if topic.type.endswith(("/Odometry", *POSES))
-        for one in topic.fields
-    )
-    wheels = set(joints) - set(of_arms(joints))
-    moves = {*log.moving}
-    turned = [topic for topic in joints if topic in wheels and f"{topic}.position[0]" in moves]
-    return "" if driven or not turned else turned[0]
+EVIDENCE: tuple[tuple[str, Callable[[Clues], str]], ...] = (  # the first that a log has decides
+    ("car", lambda clues: clues.ackermann),
+    ("crane", lambda clues: clues.hung),
+    ("arm", lambda clues: clues.turning(several=True)),
+    ("pendulum", lambda clues: clues.turning(several=False)),
+    ("drone", lambda clues: clues.topic(FLYING)),
+    ("boat", lambda clues: clues.afloat),
+    ("car", lambda clues: clues.topic("steer", fields=True)),
+    ("drone", lambda clues: clues.topic(LIFTED, fields=True)),
+    ("rover", lambda clues: clues.topic("cmd_vel", fields=True)),
+    ("differential", lambda clues: ", ".join(clues.sides)),
+    ("rover", lambda clues: clues.speed_and_turn),
+    ("balance", lambda clues: clues.balancing),
+    ("pendulum", lambda clues: clues.angle_and_torque),
+    ("rover", lambda clues: clues.flat),
+    ("generic", lambda clues: "--kind names another"),
+)
+KINDS = tuple(dict.fromkeys(kind for kind, _ in EVIDENCE))
 
 
-def by_encoders(
-    states: Sequence[Guess], log: LogReport, joints: Joints, r: float
-) -> Sequence[Guess]:
+def kind_in(clues: Clues) -> tuple[str, str]:
+    """Return the kind of robot that a log was probably recorded on, and the names that show it."""
+    return next((kind, why) for kind, of in EVIDENCE if (why := of(clues)))
+
+
+def by_encoders(states: Sequence[Guess], clues: Clues, r: float) -> Sequence[Guess]:
     """Give x and v of a balancing robot the first wheel's angle and speed, times a radius r [m]."""
-    if not (where := encoders(log, joints)):
+    if not (where := clues.encoders):
         return states
-    moving = {*log.moving}
-    wheel, ends, found = joints[where][0], {"x": "position", "v": "velocity"}, []
+    log, wheel = clues.log, clues.joints[where][0]
+    ends, guesses = {"x": "position", "v": "velocity"}, []
     for guess in states:
         path = f"{where}.{ends.get(guess.name, '')}[0]"
-        if path in moving and guess.name in ends:
+        if path in log.moving:
             why, clock = found_("start.encoder", path, joint=wheel), log.clock(log.topic_of(path))
             guess = Guess(guess.name, path, clock, False, (), log.number(path), (why,), r)
-        found.append(guess)
-    return found
+        guesses.append(guess)
+    return guesses
 
 
-def _drone(log: LogReport) -> Skeleton:
+def skeleton(kind: str, clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
+    """Return the skeleton of a kind with the log's names; `inputs` are those of a generic one."""
+    if kind == "generic":
+        return generic(clues, inputs)
+    if kind == "arm":
+        joints = next(iter((clues.arms or clues.joints).values()), ())
+        return arm(from_base(joints) if joints else ("joint1", "joint2"))
+    if kind == "drone":
+        return _drone(clues)
+    plain = fixed("balance_by_encoders" if kind == "balance" and clues.encoders else kind)
+    if kind == "car" and not clues.ackermann:
+        return _car(plain, clues)
+    if kind == "rover":
+        return pushed(plain, clues.sent, clues.units)
+    if kind in ("differential", "boat"):
+        sides = zip(plain.inputs, clues.sides, strict=False)
+        return driven_by(plain, {old: (name, "1") for old, name in sides})
+    if kind == "crane" and len(clues.sent) == 1 and not {*clues.sent} <= {*plain.inputs}:
+        unit = _volts(clues)  # else it is a force
+        gain = plain.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
+        return driven_by(plain, {"force": (next(iter(clues.sent)), unit)}, gain=gain)
+    if kind == "balance" and clues.balancing:
+        unit = _volts(clues)
+        unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
+        own = unitless if unit == "1" else {}
+        return driven_by(plain, {"voltage": (clues.balancing, unit)}, **own)
+    return plain
+
+
+def _volts(clues: Clues) -> str:
+    """Return the unit of a log's only command: V if it is a voltage, else none."""
+    ((name, path),) = clues.sent.items()
+    return "V" if command_unit(name, path, clues.units).endswith("V") else "1"
+
+
+def _drone(clues: Clues) -> Skeleton:
     """Return the drone's skeleton: its yaw is a constant if the log's hardly changes."""
-    yaws = [(t, f) for t in log.topics for f in t.fields if f.path.endswith("@rpy.yaw")]
-    commands = [t for t in log.topics if COMMANDED.search(t.topic.lower())]
+    topics = clues.log.topics
+    commands = [t for t in topics if COMMANDED.search(t.topic.lower())]
+    yaws = [(t, f) for t in topics for f in t.fields if f.path.endswith("@rpy.yaw")]
     own = next((f for t, f in yaws if t not in commands), None)
     sent = any(t in commands and f.low != f.high for t, f in yaws)
-    rates = any(_says(t, (r"angular\.z",)) for t in commands)
+    rates = any("angular.z" in f.path.lower() for t in commands for f in t.fields)
     command = "yaw_command" if sent else "yaw_rate" if rates else ""
     low, high = (own.low or 0.0, own.high or 0.0) if own else (0.0, 0.0)
     return drone(low, high, command)
 
 
-def _in_the_plane(topic: TopicReport) -> bool:
-    """Return whether a topic is odometry of a robot that moves neither up nor sideways."""
-    still = ("position.z", "linear.y", "linear.z")
-    fields = [one for one in topic.fields if one.path.endswith(still)]
-    odometry = topic.type.endswith("/Odometry") and topic.messages > 2
-    return odometry and len(fields) == 3 and all(one.low == one.high for one in fields)
-
-
-def _says(topic: TopicReport, words: Sequence[str]) -> bool:
-    everything = " ".join([topic.topic, *(one.path for one in topic.fields)]).lower()
-    return any(re.search(word, everything) for word in words)
-
-
-def _car(log: LogReport, units: Units) -> Skeleton:
+def _car(plain: Skeleton, clues: Clues) -> Skeleton:
     """Return the car skeleton: driven by the log's own command, steered in rad or unitless."""
-    numbers = [one.path for one in log.numbers]
-    said = {unit_in_name(path) for path in numbers if "steer" in _word(path).lower()} - {""}
-    angle = any(factor_between(unit, "rad") is not None for unit in said)
-    part = any(factor_between(unit, "1") is not None for unit in said)
-    throttle = any(_says(topic, ("throttle",)) for topic in log.topics)
+    steered = (one.path for one in clues.log.numbers if "steer" in _word(one.path).lower())
+    said = {unit_in_name(path) for path in steered} - {""}
+    angle, part = (any(factor_between(u, of) is not None for u in said) for of in ("rad", "1"))
+    throttle = clues.topic("throttle", fields=True)
     unit = "rad" if angle or not (throttle or part) else "1"
-    plain = driven_by(fixed("car"), {"steering": ("steering", unit)})
-    return pushed_by(plain, "throttle", "1") if throttle else pushed(plain, sent_in(log), units)
-
-
-def sent_in(log: LogReport) -> dict[str, str]:
-    """Return the paths of the numbers that are named like commands, by their names."""
-    found = moving(log)
-    return {n: one.path for n, one in found.items() if called_input(n, one.path, found)}
-
-
-def skeleton(
-    kind: str,
-    log: LogReport,
-    joints: Joints,
-    inputs: Sequence[str] = (),
-    units: Units | None = None,
-) -> Skeleton:
-    """Return the skeleton of a kind with the log's names; for the arguments see `generic`."""
-    if kind == "arm":
-        joints = of_arms(joints) or joints
-        return arm(from_base(next(iter(joints.values()))) if joints else ("joint1", "joint2"))
-    ackermann = any("Ackermann" in topic.type for topic in log.topics)
-    if kind == "car" and not ackermann:
-        return _car(log, units or {})
-    if kind == "rover":
-        return pushed(fixed(kind), sent_in(log), units or {})
-    if kind in ("differential", "boat"):
-        plain, both = fixed(kind), _both_sides(log)
-        return driven_by(plain, {old: (n, "1") for old, n in zip(plain.inputs, both, strict=False)})
-    if kind == "crane":
-        return _crane(log, units or {})
-    if kind == "balance" and (command := _balancing(log)):
-        plain = fixed("balance_by_encoders" if encoders(log, joints) else kind)
-        if command_unit(command, sent_in(log)[command], units or {}).endswith("V"):
-            return driven_by(plain, {"voltage": (command, "V")})
-        unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
-        return driven_by(plain, {"voltage": (command, "1")}, **unitless)
-    if kind == "drone":
-        return _drone(log)
-    return generic(log, inputs, units) if kind == "generic" else fixed(kind)
+    plain = driven_by(plain, {"steering": ("steering", unit)})
+    if throttle:
+        return pushed_by(plain, "throttle", "1")
+    return pushed(plain, clues.sent, clues.units)
