@@ -189,35 +189,6 @@ def probe(model: Model, dt: float) -> float:
     return max(1, round(dt / own)) * own if own else dt
 
 
-def undeclared_angles(model: Model) -> list[str]:
-    """Return states in rad that no angle is declared of, though a turn leaves the model the same.
-
-    A log that wraps at pi then shows a jump of 6.28 rad, and errors of a turn count.
-    """
-    bare = motion(model)
-    (x, u), dt, found = samples(bare, 8), probe(bare, INSTANT_S), list[str]()
-    if getattr(bare.step, "timestep", None) is not None:
-        return found  # a simulator says itself
-
-    def rates(at: Array) -> Array:
-        return np.asarray(bare.system.step(at, u, bare.values, dt) - at) / dt
-
-    for i, (name, unit) in enumerate(bare.states.items()):
-        if unit != "rad" or name in bare.angles:
-            continue
-        turned, moved = x.copy(), x.copy()
-        turned[:, i] += 2 * np.pi
-        moved[:, i] += 1.0
-        with np.errstate(all="ignore"):
-            before, after, other = rates(x), rates(turned), rates(moved)
-        size = np.abs(before).max(axis=0) + np.abs(other).max(axis=0) + 1e-9
-        same = np.abs(after - before).max(axis=0) <= STRAIGHT * size
-        differs = np.abs(other - before).max(axis=0) > MOVES_STATE * size
-        if same.all() and differs.any():
-            found.append(name)
-    return found
-
-
 def direct(model: Model) -> Model:
     """Return the model without adopted effects on its inputs, with the current parameters.
 

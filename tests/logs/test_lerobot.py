@@ -97,8 +97,11 @@ def test_names_that_are_none_are_numbered(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_three_commands_lead_to_a_diagnosis(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(folder.parent)
+def test_three_commands_lead_to_a_diagnosis(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset(tmp_path / "so100", "v3.0", NAMES, [episode(k) for k in range(3)])
+    monkeypatch.chdir(tmp_path)
     assert grounded("init", "arm", "--from", "so100", "--yes").code == 0
     assert grounded("-C", "arm", "ingest", "--data", "so100").code == 0
     again = json.loads(grounded("-C", "arm", "ingest", "--data", "so100", "--json").out)

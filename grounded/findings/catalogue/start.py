@@ -54,8 +54,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "angles": Entry(
         "note",
-        "{about} {about:is/are} {about:an angle/angles} by the model's equations",
-        "declare angles = {declared} in model.py, or a log that wraps at pi jumps by 6.28 rad",
+        "{about} is a heading, of which a whole turn counts as an error",
+        "declare angles = {declared} in model.py",
     ),
     "interval": Entry(
         "note",

@@ -154,20 +154,6 @@ def is_angle(path: str) -> bool:
     return bool(ANGLE.search(path.lower()))
 
 
-def may_be(path: str, unit: str, joints: Mapping[str, str] | None = None) -> bool:
-    """Check whether a number may be a state with a given unit, by its name and by convention.
-
-    Args:
-        path: a message path.
-        unit: of the state.
-        joints: see `unit_of`.
-    """
-    if unit in LENGTHS and is_angle(path):
-        return False
-    known = unit_of(path, joints)
-    return not (known and unit not in ("", "1")) or factor_between(known, unit) is not None
-
-
 @lru_cache(maxsize=4096)
 def in_english(name: str) -> str:
     """Return a name in lower case with its foreign words translated, `u_Nick` as `u_pitch`."""

@@ -21,7 +21,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import rate_states, undeclared_angles
+from grounded.places import heading, rate_states
 from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import about_table
@@ -340,8 +340,8 @@ def _on_own(report: LogReport, guesses: Sequence[Guess], model: Model) -> Iterat
     if left := [path for path in left if not PARTS.search(path)]:
         more = [f"{len(left) - NAMED} more"] * (len(left) > NAMED)
         yield found("start.unused", *left[:NAMED], *more)
-    if names := undeclared_angles(model):
-        yield found("start.angles", *names, declared=(*model.angles, *names))
+    if (name := heading(model)) and name not in model.angles:
+        yield found("start.angles", name, declared=(*model.angles, name))
     if without := getattr(model.step, "without", ()):
         yield found("start.unmoved", *without)
 

@@ -48,7 +48,7 @@ from grounded_trials.logs.inspection.relations import (
     Signals,
     follows,
 )
-from grounded_trials.logs.inspection.steps import by_groups, by_inputs
+from grounded_trials.logs.inspection.steps import by_inputs
 from grounded_trials.logs.stated_units import (
     LENGTHS,
     Stated,
@@ -132,7 +132,7 @@ def assigned(
         for pair in rate_states(model).items():
             if set(pair) <= guesses.keys():
                 guesses |= _followed(guesses, pair, signals, table)
-        guesses = _by_steps(guesses, model, signals, table)
+        guesses = _by_steps(guesses, model, signals)
         guesses = guesses if given else _the_rest(guesses, model, signals, table)
     done = [table.finished(guess) for guess in guesses.values()]
     return tuple(done[: len(states)]), tuple(done[len(states) :])
@@ -616,21 +616,10 @@ def _in_units(
     return q, replace(w, sure=w.sure or (q.sure and alone[1]))
 
 
-def _by_steps(
-    guesses: Mapping[str, Guess], model: Model, signals: Signals, table: _Table
-) -> dict[str, Guess]:
-    """Return the guesses after the model's steps have chosen among those that are left."""
-    measured = joint_units(table.joints)
+def _by_steps(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict[str, Guess]:
+    """Return the guesses after the model's steps have chosen among the inputs that are left."""
     signals.read(p for g in guesses.values() for p in (g.path, *g.others) if p)
-    moving = [n.path for n in table.numbers if n.moves]
-    signals.read(moving * (len(moving) <= 2 * UNNAMED_BESIDE))
-    bare = [
-        pair
-        for pair in rate_states(model).items()
-        if not any((name, guesses[name].path) in table.named for name in pair)
-    ]
-    guesses = {**guesses, **by_groups(model, guesses, bare, signals, measured)}
-    return guesses | by_inputs(model, guesses, signals)
+    return {**guesses, **by_inputs(model, guesses, signals)}
 
 
 def _the_rest(

@@ -1,13 +1,9 @@
-"""Decide between assignments by the steps of the model, where names, units and rates don't.
+"""Decide which number is which input by the steps of the model, where names and units don't.
 
-`by_groups` assigns positions with their rates. A trolley and the load below it both have a position
-and a rate that follows it, so derivatives can't tell them apart: they are right or wrong together.
-With each assignment the calibrated model predicts the log a quarter of a second ahead.
-
-`by_inputs` assigns inputs. A model skeleton has neither correct masses nor gravity, so the size of
-its error is meaningless: the smaller of two torques fits anywhere. What is compared is the part of
-each state's motion that remains after removing everything that the states may explain (drag,
-springs, gravity) and after giving every input its best gain, with the model's sign.
+A model skeleton has neither correct masses nor gravity, so the size of its error is meaningless:
+the smaller of two torques fits anywhere. What is compared is the part of each state's motion that
+remains after removing everything that the states may explain (drag, springs, gravity) and after
+giving every input its best gain, with the model's sign.
 
 An assignment is taken if it is clearly better than every other one; else all of them are named.
 """
@@ -16,24 +12,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import islice, permutations, product
+from itertools import islice
 
 import numpy as np
 
-from grounded.accounts.motion import HALF_ERROR, MARGIN, Ahead
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import probe
-from grounded.trial import Trial
-from grounded.units import factor_between
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.relations import COMBINATIONS, Signals
-from grounded_trials.logs.stated_units import may_be
 
-STARTS = 120  # samples to predict from
-MOST_SIGNALS = 16  # largest number of signals among which positions and rates are sought
 WINDOW = 0.05  # [s] length of a step: in shorter ones noise dominates
 PIECES = 8  # pieces of the log, evaluated separately
 PIECE_STEPS = 20  # steps of a piece; short logs have fewer pieces
@@ -42,162 +32,11 @@ USE = 0.1  # [nats] lead over no input at all
 SCATTER = 2.0  # standard errors over the pieces by which the lead must be significant
 PIECES_AGREE = 0.75  # share of the pieces that must agree
 TELLS = 0.05  # [nats] with less difference a state does not distinguish assignments
-Pair = tuple[str, str]  # a position and its rate: names, or paths
-Way = tuple[Pair, ...]  # the paths of each pair of states, in order
-
-
-def by_groups(
-    model: Model,
-    guesses: Mapping[str, Guess],
-    pairs: Sequence[Pair],
-    signals: Signals,
-    joints: Mapping[str, str],
-) -> dict[str, Guess]:
-    """Assign positions and rates without matching names, all together; unsure if undecided.
-
-    Args:
-        model: however crude.
-        guesses: of all its states and inputs.
-        pairs: position and rate states without a matching name.
-        signals: the samples of all candidates.
-        joints: units of joints' numbers by path.
-    """
-    said = tuple((guesses[q].path, guesses[w].path) for q, w in pairs)
-    there = _in_log(guesses, said, signals) if pairs else []
-    ways = [way for way in permutations(there, len(pairs)) if _distinct(way)]
-    if not pairs or not 1 < len(ways) <= COMBINATIONS:
-        return {}
-    fits = [way for way in ways if _of_their_units(way, pairs, model, signals, joints)]
-    whole = all(path for pair in said for path in pair)
-    first = said if whole and (said in fits or (said in ways and not fits)) else [*fits, *ways][0]
-    left = {
-        way: error
-        for way in ways
-        if (error := _ahead_of(model, guesses, pairs, way, signals)) is not None
-    }
-    best = min(left, key=lambda way: float(left[way].sum()), default=first)
-    clear = len(left) == len(ways) and all(
-        _apart_clearly(left[best], left[way]) for way in ways if way != best
-    )
-    if not clear or best not in fits:
-        rivals = [way for way in fits or ways if way != first]
-        return _given(guesses, pairs, first, rivals, *[found("start.steps")] * bool(left))
-    second = min((way for way in ways if way != best), key=lambda way: float(left[way].sum()))
-    gain = float((left[second] - left[best]).sum()) / len(model.states)
-    return _given(guesses, pairs, best, (), _better(gain))
 
 
 def _better(gain: float) -> Finding:
     """Return by how much an assignment fits better than the next best, by the log of its error."""
     return found("start.steps", share=float(1 - np.exp(-gain)), nats=gain)
-
-
-def _in_log(guesses: Mapping[str, Guess], said: Way, signals: Signals) -> list[Pair]:
-    """Return the positions with their rates among the log's unassigned numbers."""
-    own = {path for pair in said for path in pair if path}
-    taken = {guess.path for guess in guesses.values()} - own
-    free = [path for path in signals.found if path not in taken]
-    rates = signals.rates(free if len(free) <= MOST_SIGNALS else sorted(own))
-    whole = [pair for pair in said if all(pair)]
-    return list(dict.fromkeys([*whole, *((q, w) for q, (w, by) in rates.items() if by == 1)]))
-
-
-def _distinct(way: Way) -> bool:
-    paths = [path for pair in way for path in pair]
-    return len(set(paths)) == len(paths)
-
-
-def _of_their_units(
-    way: Way,
-    pairs: Sequence[Pair],
-    model: Model,
-    signals: Signals,
-    joints: Mapping[str, str],
-) -> bool:
-    """Check that every number has a unit that fits its state."""
-    both = [one for k, pair in enumerate(pairs) for one in zip(pair, way[k], strict=True)]
-    units = [(model.states[name], path, signals.stated.unit(path)) for name, path in both]
-    return all(
-        may_be(path, unit, joints) and not (said and factor_between(said, unit) is None)
-        for unit, path, said in units
-    )
-
-
-def _ahead_of(
-    model: Model,
-    guesses: Mapping[str, Guess],
-    pairs: Sequence[Pair],
-    way: Way,
-    signals: Signals,
-) -> Array | None:
-    """Return the logarithm of each state's error (n,) relative to its changes; None if unknown.
-
-    An unsure input is taken from whichever of its rivals, or those of other unsure ones, fits best.
-    """
-    names, paths = [*model.state_names, *model.input_names], {n: g.path for n, g in guesses.items()}
-    paths |= {n: p for k, pair in enumerate(pairs) for n, p in zip(pair, way[k], strict=True)}
-    states = {paths[name] for name in model.state_names}
-    own = [guesses[name] for name in model.input_names]
-    open_ = [one.path for one in own if not one.sure]  # commands may be exchanged like joints
-    may = [dict.fromkeys((g.path, *g.others, *open_ * (not g.sure))) for g in own]
-    inputs = [[path for path in some if path and path not in states] for some in may]
-    tried = []
-    for chosen in islice(product(*inputs), COMBINATIONS):
-        sent = dict(zip(model.input_names, chosen, strict=True))
-        ahead = _ahead(model, guesses, [(paths | sent)[name] for name in names], signals)
-        if ahead is not None and ahead.enough:
-            rms, moved = ahead.best([np.ones(model.m)]).rms, (ahead.last - ahead.first).std(axis=0)
-            tried.append(np.log(rms / np.maximum(moved, ahead.least)))
-    return min(tried, key=lambda one: float(one.sum()), default=None)
-
-
-def _ahead(
-    model: Model, guesses: Mapping[str, Guess], paths: Sequence[str], signals: Signals
-) -> Ahead | None:
-    """Return the model's predictions of the log, with states and inputs read at some paths."""
-    gridded = signals.grid(paths) if len(set(paths)) == len(paths) else None
-    if gridded is None:
-        return None
-    units = {**model.states, **model.inputs}
-    scale = {guess.path: guess.scale for guess in guesses.values()}
-    by = [
-        scale.get(path, 1.0) * signals.stated.factor(path, unit)
-        for path, unit in zip(paths, units.values(), strict=True)
-    ]
-    values = np.column_stack(gridded[1]) * by
-    n = model.n
-    names = model.state_names, model.input_names
-    trial = Trial(values[:, :n], values[:-1, n:], gridded[0], *names)
-    with np.errstate(all="ignore"):
-        return Ahead(model, trial, range(n), STARTS)
-
-
-def _apart_clearly(best: Array, other: Array) -> bool:
-    """Check whether errors are clearly smaller, in total and for at least one state."""
-    gained = other - best
-    return float(gained.sum()) > MARGIN and float(gained.max()) > -np.log(HALF_ERROR)
-
-
-def _given(
-    guesses: Mapping[str, Guess],
-    pairs: Sequence[Pair],
-    way: Way,
-    rivals: Sequence[Way],
-    *why: Finding,
-) -> dict[str, Guess]:
-    """Return the guesses with their paths; sure, as a group, if there are no rivals."""
-    known = {guess.path: guess for guess in guesses.values()}
-    paths = {n: p for k, pair in enumerate(pairs) for n, p in zip(pair, way[k], strict=True)}
-    scales = {path: known[path].scale if path in known else 1.0 for path in paths.values()}
-    plain = bool(why) and not rivals and all(scale == 1 for scale in scales.values())
-    moved = {}
-    for k, pair in enumerate(pairs):
-        for j, name in enumerate(pair):
-            path = paths[name]
-            others = tuple(dict.fromkeys(one[k][j] for one in rivals if one[k][j] != path))
-            reasons = (*(known[path].reasons if path in known else ()), *why)
-            moved[name] = Guess(name, path, "", plain, others, None, reasons, scales[path])
-    return moved
 
 
 Paths = tuple[str, ...]
