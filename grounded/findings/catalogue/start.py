@@ -12,8 +12,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "joint": Entry(
         "note",
-        "[[{index} of ]]{about} is its joint[[ '{joint}']][[index? , in order from the base]]"
-        "[[effort? , whose measured effort it alone follows]]",
+        "[[{index} of ]]{about} is its joint[[ '{joint}']][[index? , in order from the base]]",
         "[[index? check it by the joints of the controller]]",
     ),
     "follows": Entry(

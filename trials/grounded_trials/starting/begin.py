@@ -169,68 +169,56 @@ def begin(
     given = [str(part) for key, value in options.items() if value for part in (key, value)]
     again = (f"{folder}-2", "--from", str(log), *given)
     with fresh_folder(folder, files):
-        kind = "generic" if inputs else kind or ""
-        return _begin(folder, log, own, kind, dt, inputs, layout, ask, again)
+        # What the log has, and the model: the user's, or a skeleton of the kind of robot.
+        logs, report, notes = _usable(log, layout)
+        clues = Clues(report, joint_names(report), column_units(logs[0]))
+        drawn = _Draft(folder, clues, own, inputs)
+        drawn.begin("generic" if inputs else kind or "")
 
+        # Which number is which signal, and in which units.
+        units = {**drawn.model.states, **drawn.model.inputs}
+        states, commands = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
+        drawn.with_gain((*states, *commands))
+        odd = perhaps_degrees((*states, *commands), drawn.model, clues.joints)
+        commands = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in commands]
+        slow = () if layout.rate or about_table(logs[0]).in_time_units else _in_seconds(report)
 
-def _begin(
-    folder: Path,
-    log: str | Path,
-    own: OwnModel | None,
-    kind: str,
-    dt: float | None,
-    named: Sequence[str],
-    layout: Layout,
-    ask: Ask | None,
-    again: tuple[str, ...],
-) -> Begun:
-    # What the log has, and the model: the user's, or a skeleton of the kind of robot.
-    files, report, notes = _usable(log, layout)
-    clues = Clues(report, joint_names(report), column_units(files[0]))
-    drawn = _Draft(folder, report, clues, own, named)
-    drawn.begin(kind)
+        # The control interval, and the ranges: zero is sent after a run, so limits must include it.
+        if dt:
+            step, note = dt, too_coarse(report, commands, dt)
+        else:
+            step, note = interval_of(report, commands, states)
+        made = own.in_step(folder, drawn.model, step) if own else drawn.model
+        ranges = {g.name: g.extent for g in (*states, *commands)}
+        for g in commands if drawn.kind != "drone" else ():
+            if (seen := ranges[g.name]) is not None:
+                ranges[g.name] = min(seen[0], 0.0), max(seen[1], 0.0)
 
-    # Which number is which signal, and in which units.
-    units = {**drawn.model.states, **drawn.model.inputs}
-    states, inputs = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
-    drawn.with_gain((*states, *inputs))
-    odd = perhaps_degrees((*states, *inputs), drawn.model, clues.joints)
-    inputs = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in inputs]
-    slow = () if layout.rate or about_table(files[0]).in_time_units else _in_seconds(report)
-
-    # The control interval, and the ranges: zero is sent after a run, so limits must include it.
-    step, note = (dt, too_coarse(report, inputs, dt)) if dt else interval_of(report, inputs, states)
-    model = own.in_step(folder, drawn.model, step) if own else drawn.model
-    ranges = {g.name: g.extent for g in (*states, *inputs)}
-    for g in inputs if drawn.kind != "drone" else ():
-        if (seen := ranges[g.name]) is not None:
-            ranges[g.name] = min(seen[0], 0.0), max(seen[1], 0.0)
-
-    # The files: the target is read from the log as its [log] table says.
-    table = mapping_toml(
-        states, inputs, simulated=report.simulated, rates=rate_states(model), layout=layout
-    )
-    columns, sent, odd_run = _recorded(files, tomllib.loads(table), model, states, step)
-    horizon = len(next(iter(columns.values()))) - 1
-    stood = held_first(model, columns, sent, step, ranges) or {}
-    name, why = Path(log).name, drawn.why
-    write_first(folder, model, step, columns, horizon, ranges, table, why, name, stood)
-    doubts = [odd[g.name] for g in states if g.name in odd]
-    more = [*_on_own(report, (*states, *inputs), model)] if own else []
-    return Begun(
-        workspace=str(folder),
-        log=str(log),
-        kind="" if own else drawn.kind,
-        why=why,
-        dt=step,
-        horizon=horizon,
-        states=tuple(states),
-        inputs=tuple(inputs),
-        target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
-        start=", ".join(f"{n} = {value:.4g}" for n, value in stood.items()) or "empty",
-        findings=(*notes, *drawn.notes, *slow, *doubts, *more, *note, *odd_run),
-        again=again if slow else (),
-    )
+        # The files: the target is read from the log as its [log] table says.
+        table = mapping_toml(
+            states, commands, simulated=report.simulated, rates=rate_states(made), layout=layout
+        )
+        columns, sent, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
+        horizon = len(next(iter(columns.values()))) - 1
+        stood = held_first(made, columns, sent, step, ranges) or {}
+        name, why = Path(log).name, drawn.why
+        write_first(folder, made, step, columns, horizon, ranges, table, why, name, stood)
+        doubts = [odd[g.name] for g in states if g.name in odd]
+        more = [*_on_own(report, (*states, *commands), made)] if own else []
+        return Begun(
+            workspace=str(folder),
+            log=str(log),
+            kind="" if own else drawn.kind,
+            why=why,
+            dt=step,
+            horizon=horizon,
+            states=tuple(states),
+            inputs=tuple(commands),
+            target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
+            start=", ".join(f"{n} = {value:.4g}" for n, value in stood.items()) or "empty",
+            findings=(*notes, *drawn.notes, *slow, *doubts, *more, *note, *odd_run),
+            again=again if slow else (),
+        )
 
 
 @dataclass(eq=False)
@@ -238,7 +226,6 @@ class _Draft:
     """The model of a new workspace, and the numbers that its signals are taken from."""
 
     folder: Path
-    report: LogReport
     clues: Clues
     own: OwnModel | None
     named: Sequence[str]  # inputs of a generic skeleton
@@ -268,7 +255,7 @@ class _Draft:
     def with_gain(self, signals: Sequence[Guess]) -> None:
         """Write the gain that the log shows into a skeleton that has one."""
         if self.plain is not None:
-            full = with_gain(self.plain, {g.name: g for g in signals}, self.report)
+            full = with_gain(self.plain, {g.name: g for g in signals}, self.clues.log)
             if full is not self.plain:
                 self._write(full)
 
@@ -293,7 +280,7 @@ class _Draft:
     def _match(self, given: Mapping[str, str] = MappingProxyType({})) -> None:
         model = self.model
         self.matched = assigned(
-            self.report, model.states, model.inputs, model, self.clues.joints, given
+            self.clues.log, model.states, model.inputs, model, self.clues.joints, given
         )
 
     def _write(self, plain: Skeleton) -> None:

@@ -17,9 +17,11 @@ is listed. A role that no name fits gets a number only if as many fit as there a
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +35,6 @@ from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, 
 from grounded_trials.logs.inspection.joint_names import (
     NAMED,
     Joint,
-    by_efforts,
     in_order,
     joint_names,
     joint_units,
@@ -117,23 +118,17 @@ def assigned(
         joints: the result of `joint_names`, if already known.
         given: numbers after which some states and inputs are named.
     """
-    joints = joint_names(log) if joints is None else joints
-    table = _Table(log, states, inputs, joints)
+    table = _Table(log, states, inputs, joint_names(log) if joints is None else joints, model)
     for name, path in ((n, p) for n, p in given.items() if n in table.row):
         table.add(name, path, 2 * CAP)
         table.named.add((name, path))
-    signals = None
-    if model is not None and table.numbers:
-        angles = {n.path for n in table.numbers if n.known == "rad" or n.said in ("", "rad", "deg")}
-        signals = Signals(log, angles, table.stated)
-        table.look(model, signals)
-    guesses = {guess.name: guess for guess in table.solved()}
-    if model is not None and signals is not None:
-        for pair in rate_states(model).items():
-            if set(pair) <= guesses.keys():
-                guesses |= _followed(guesses, pair, signals, table)
-        guesses = _by_steps(guesses, model, signals)
-        guesses = guesses if given else _the_rest(guesses, model, signals, table)
+    table.look()
+    guesses = table.solved(by_order=not given)
+    for pair in table.rates.items():
+        guesses |= _followed(guesses, pair, table)
+    if model is not None:
+        table.signals.read(p for g in guesses.values() for p in (g.path, *g.others) if p)
+        guesses |= by_inputs(model, guesses, table.signals)
     done = [table.finished(guess) for guess in guesses.values()]
     return tuple(done[: len(states)]), tuple(done[len(states) :])
 
@@ -147,8 +142,12 @@ class _Table:
         states: Mapping[str, str],
         inputs: Mapping[str, str],
         joints: Mapping[str, tuple[str, ...]],
+        model: Model | None,
     ) -> None:
         self.log, self.joints, self.stated = log, joints, Stated.by(log.files)
+        self.model, own = model, {*states, *inputs}
+        rates = rate_states(model) if model is not None else {}
+        self.rates = {q: w for q, w in rates.items() if {q, w} <= own}
         self.units = {**states, **inputs}
         self.roles = [_Role(n, u, False) for n, u in states.items()]
         self.roles += [_Role(n, u, True) for n, u in inputs.items()]
@@ -166,6 +165,9 @@ class _Table:
             for one in topic.fields
             if not words.PARTS.search(one.path)
         ]
+        turn = ("", "rad", "deg")
+        angles = {n.path for n in self.numbers if n.known == "rad" or n.said in turn}
+        self.signals = Signals(log, angles, self.stated)
         self.at = {number.path: k for k, number in enumerate(self.numbers)}
         self.row = {role.name: r for r, role in enumerate(self.roles)}
         self.points = np.zeros((len(self.roles), len(self.numbers)))
@@ -247,35 +249,31 @@ class _Table:
 
     def _at_home(self) -> None:
         """Count that states come from one message, that a pose is measured, and what changes."""
-        states = [role for role in self.roles if not role.sent]
-        homes: dict[str, set[str]] = {}
-        for role in states:
-            for number in self._fitting(role.name):
-                homes.setdefault(number.topic.topic, set()).add(role.name)
+        fitting = {role.name: self._fitting(role.name) for role in self.roles if not role.sent}
+        homes = Counter(t for some in fitting.values() for t in {n.topic.topic for n in some})
         bonus = []
-        for role in states:
-            row, fitting = self.points[self.row[role.name]], self._fitting(role.name)
-            best = max((row[self.at[n.path]] for n in fitting), default=0.0)
-            reckoned = {k: n for n in fitting if (k := _pose(n.path)) and _reckons(n.topic)}
-            for number in fitting:
-                points = HOME * len(homes[number.topic.topic])
-                points += 0.1 * float(np.log10(1 + number.topic.rate_hz))
-                wheels = reckoned.get(_pose(number.path))
-                often = wheels and number.topic.rate_hz >= AS_OFTEN * wheels.topic.rate_hz
-                near = row[self.at[number.path]] > best - SURE_LEAD
-                if often and near and wheels and number.topic.type.endswith(words.POSES):
-                    points += POSE
-                    self.add(role.name, number.path, 0, found("start.pose", wheels.topic.topic))
-                    self.doubted.add((role.name, number.path))
-                alive = [n for n in fitting if n.moves and _alike(n.path, number.path)]
-                if not number.moves and number.field.low is not None and alive:
-                    here = row[self.at[number.path]] + points
-                    points += ALIVE
-                    for one in alive:
-                        if here >= row[self.at[one.path]] + HOME * len(homes[one.topic.topic]):
-                            self.add(role.name, one.path, 0, found("start.still", number.path))
-                            self.doubted.add((role.name, one.path))
-                bonus.append((role.name, number.path, points))
+        for name, numbers in fitting.items():
+            row = self.points[self.row[name]]
+            best = max((row[self.at[n.path]] for n in numbers), default=0.0)
+            reckoned = {k: n for n in numbers if (k := _pose(n.path)) and _reckons(n.topic)}
+            for number in numbers:
+                topic, here = number.topic, row[self.at[number.path]]
+                points = HOME * homes[topic.topic] + 0.1 * float(np.log10(1 + topic.rate_hz))
+                if (wheels := reckoned.get(_pose(number.path))) and topic.type.endswith(
+                    words.POSES
+                ):
+                    often = topic.rate_hz >= AS_OFTEN * wheels.topic.rate_hz
+                    if often and here > best - SURE_LEAD:
+                        points += POSE
+                        self.add(name, number.path, 0, found("start.pose", wheels.topic.topic))
+                        self.doubted.add((name, number.path))
+                still = not number.moves and number.field.low is not None
+                for one in (n for n in numbers if still and n.moves and _alike(n, number)):
+                    if here + points >= row[self.at[one.path]] + HOME * homes[one.topic.topic]:
+                        self.add(name, one.path, 0, found("start.still", number.path))
+                        self.doubted.add((name, one.path))
+                points += ALIVE * any(still and n.moves and _alike(n, number) for n in numbers)
+                bonus.append((name, number.path, points))
         for name, path, points in bonus:
             self.add(name, path, points)
 
@@ -302,25 +300,22 @@ class _Table:
         pairs = zip(rows, columns, strict=True)
         return {self.roles[r].name: self.numbers[k].path for r, k in pairs if k < numbers}
 
-    def look(self, model: Model, signals: Signals) -> None:
-        """Count what the samples say of rates, speeds, angles' commands and efforts."""
+    def look(self) -> None:
+        """Count what the samples say of rates, of speeds and of angles' commands."""
+        if self.model is None or not self.numbers:
+            return
         first = self.taken()
         for role in (one for one in self.roles if one.sent):
-            if path := by_efforts(role.name, self.joints, signals, self.log):
-                self.add(role.name, path, CAP, found("start.joint", path, effort=True))
-                self.doubted.discard((role.name, path))
-            angle = first.get(without_role(role.name), "")
-            path = first.get(role.name, "")
+            angle, path = first.get(without_role(role.name), ""), first.get(role.name, "")
             if angle and path.endswith("@rpy." + path.rpartition(".")[2]) and angle != path:
-                like = signals.lagged([path], [angle], LATEST)
-                if like is not None and like[0, 0] < FOLLOWS:
+                like = self.signals.lagged(path, angle, LATEST)
+                if like is not None and like < FOLLOWS:
                     self.add(role.name, path, -2 * CAP)
-        for pair in rate_states(model).items():
-            if set(pair) <= self.row.keys():
-                self._relate(pair, first, signals)
-        self._speed(model, signals)
+        for pair in self.rates.items():
+            self._relate(pair, first)
+        self._speed(self.model)
 
-    def _relate(self, pair: tuple[str, str], first: Mapping[str, str], signals: Signals) -> None:
+    def _relate(self, pair: tuple[str, str], first: Mapping[str, str]) -> None:
         """Count how well candidates for a rate follow those for its position."""
         q, w = pair
         taken = {path for name, path in first.items() if name not in pair}
@@ -332,9 +327,9 @@ class _Table:
         bare = [name for name in pair if not own[name]]
         if len(free) <= (UNNAMED_BESIDE if first else UNNAMED_AT_ALL):
             own |= {name: self._possible(name, free) for name in bare}
-        like = self._likes(own[q], own[w], signals)
+        like = self._likes(own[q], own[w])
         if not (bare or like) and len(free) <= UNNAMED_AT_ALL:  # a name may mislead
-            more = self._likes(own[q][:1], self._possible(w, free), signals)
+            more = self._likes(own[q][:1], self._possible(w, free))
             like |= more
             for path in own[w] if more else ():
                 self.add(w, path, -CAP)
@@ -384,15 +379,13 @@ class _Table:
     def _has(number: _Number, unit: str) -> bool:
         return factor_between(number.said or number.known, unit) is not None
 
-    def _likes(
-        self, first: Sequence[str], second: Sequence[str], signals: Signals
-    ) -> dict[tuple[str, str], Follows]:
+    def _likes(self, first: Sequence[str], second: Sequence[str]) -> dict[tuple[str, str], Follows]:
         """Return which numbers follow which, and how."""
-        signals.read([*first, *second])
-        likes = {(a, b): signals.follows(a, b) for a in first for b in second if a != b}
+        self.signals.read([*first, *second])
+        likes = {(a, b): self.signals.follows(a, b) for a in first for b in second if a != b}
         return {pair: one for pair, one in likes.items() if abs(one.correlation) >= FOLLOWS}
 
-    def _speed(self, model: Model, signals: Signals) -> None:
+    def _speed(self, model: Model) -> None:
         """Count how an unnamed number follows the speed of the position."""
         name, position = str(model.roles.get("speed", "")), model.roles.get("position", ())
         first = self.taken()
@@ -401,46 +394,42 @@ class _Table:
         axes, taken = [first[axis] for axis in position], {*first.values()}
         bare = [n.path for n in self.numbers if n.moves and n.path not in taken]
         bare = [p for p in bare if p.partition("[")[0].endswith(".data")][:COMBINATIONS]
-        signals.read([*axes, *bare] * bool(axes))
+        self.signals.read([*axes, *bare] * bool(axes))
         for path in bare * bool(axes):
-            if gridded := signals.grid((*axes, path)):
-                step, (*places, speed) = gridded
-                by = [
-                    self.stated.factor(p, model.states[n])
-                    for n, p in zip(position, axes, strict=True)
-                ]
-                moved = [f * np.diff(p) for f, p in zip(by, places, strict=True)]
-                way = np.concatenate([[0.0], np.cumsum(np.sqrt(sum(m**2 for m in moved)))])
-                like = follows(way, speed * self.stated.factor(path, self.units[name]), step)
-                if like.correlation > FOLLOWS:
-                    why = found(
-                        "start.follows",
-                        name,
-                        of=tuple(position),
-                        speed=True,
-                        correlation=like.correlation,
-                        slope=like.slope,
-                    )
-                    self.add(name, path, POINTS_TO_PROPOSE + _capped(like), why)
-                    self.doubted.add((name, path))
+            if (gridded := self.signals.grid((*axes, path))) is None:
+                continue
+            step, (*places, speed) = gridded
+            by = [self.factor(n, p) for n, p in zip(position, axes, strict=True)]
+            moved = [f * np.diff(p) for f, p in zip(by, places, strict=True)]
+            way = np.concatenate([[0.0], np.cumsum(np.sqrt(sum(m**2 for m in moved)))])
+            like = follows(way, speed * self.factor(name, path), step)
+            if like.correlation > FOLLOWS:
+                facts: dict[str, Any] = {"correlation": like.correlation, "slope": like.slope}
+                why = found("start.follows", name, of=tuple(position), speed=True, **facts)
+                self.add(name, path, POINTS_TO_PROPOSE + _capped(like), why)
+                self.doubted.add((name, path))
 
-    def solved(self) -> list[Guess]:
-        """Return the assignment of most points, and where it leaves roles what else fits them."""
+    def solved(self, *, by_order: bool) -> dict[str, Guess]:
+        """Return the assignment of most points by name, and where it leaves roles what is left.
+
+        Args:
+            by_order: whether inputs may take what is left in the log's order.
+        """
         taken = self.taken()
         sent = {path for name, path in taken.items() if self.roles[self.row[name]].sent}
-        made = []
+        made = self._left_over(taken, by_order)
         for role in self.roles:
-            path, name = taken.get(role.name, ""), role.name
-            away = {*taken.values()} - sent if role.sent else sent
-            near = tuple(p for p in self._near(name) if p != path and p not in away)
-            sure = not near and (name, path) in self.named - self.doubted
-            why = tuple(self.why.get((name, path), ()))
-            made.append(Guess(name, path, "", bool(path) and sure, near, None, why))
-        alone = self._alone(taken)
-        return [alone.get(guess.name, guess) for guess in made]
+            if path := taken.get(role.name, ""):
+                name = role.name
+                away = {*taken.values()} - sent if role.sent else sent
+                near = tuple(p for p in self._near(name) if p != path and p not in away)
+                sure = not near and (name, path) in self.named - self.doubted
+                why = tuple(self.why.get((name, path), ()))
+                made[name] = Guess(name, path, "", sure, near, None, why)
+        return {role.name: made[role.name] for role in self.roles}
 
-    def _alone(self, taken: Mapping[str, str]) -> dict[str, Guess]:
-        """Return roles without enough points, with a number if as many fit, or with what fits."""
+    def _left_over(self, taken: Mapping[str, str], by_order: bool) -> dict[str, Guess]:
+        """Return roles without enough points: with a number if as many fit, else with what fits."""
         left = [n for n in self.numbers if n.moves and n.path not in {*taken.values()}]
         lost = [role for role in self.roles if role.name not in taken]
         tops: dict[str, list[str]] = {}
@@ -448,18 +437,23 @@ class _Table:
             row = self.points[self.row[role.name]]
             fits = {n.path: row[self.at[n.path]] for n in left if row[self.at[n.path]] >= 1.0}
             tops[role.name] = [p for p in fits if fits[p] > max(fits.values()) - LEAD]
+        inputs = [role.name for role in lost if role.sent]
+        if by_order := by_order and not any(tops.values()) and self._any_order(taken, lost, left):
+            tops |= {name: [number.path for number in left] for name in inputs}
+
+        # As many roles as numbers of which each fits each: the log's order is theirs.
         made, given = {}, set[str]()
         for role in lost:
             name, top = role.name, tops[role.name]
             alike = [other for other, some in tops.items() if some == top]
             sole = all(some == top or not {*some} & {*top} for some in tops.values())
-            said = all(self.stated.unit(path) for path in top)
-            if top and sole and len(top) == len(alike) and (said or len(top) == 1):
+            said = by_order or len(top) == 1 or all(self.stated.unit(path) for path in top)
+            if top and sole and len(top) == len(alike) and said:
                 path = top[alike.index(name)]
                 number = self.numbers[self.at[path]]
                 clear = number.command and self.points[self.row[name], self.at[path]] >= SURE_LEAD
-                sure = clear or len(lost) == len(left) == 1
-                why = found("start.left", name, numbers=tuple(top), only=True)
+                sure = (clear or len(lost) == len(left) == 1) and not by_order
+                why = found("start.left", name, numbers=tuple(top), only=not by_order or None)
                 rest = tuple(p for p in top if p != path)
                 known = tuple(self.why.get((name, path), ()))
                 made[name] = Guess(name, path, "", not rest and sure, rest, None, (*known, why))
@@ -467,6 +461,24 @@ class _Table:
         for role in (one for one in lost if one.name not in made):
             made[role.name] = self._offered(role, [n for n in left if n.path not in given])
         return made
+
+    def _any_order(
+        self, taken: Mapping[str, str], lost: Sequence[_Role], left: Sequence[_Number]
+    ) -> bool:
+        """Check whether the numbers that are left can only be the inputs that are lost.
+
+        So it is if as many are left, and every state is known, or the rate of one that is.
+        """
+        inputs = [role for role in lost if role.sent]
+        known = {*taken, *(w for q, w in self.rates.items() if q in taken)}
+        states = [role.name for role in self.roles if not role.sent]
+        named = any((name, taken.get(name)) in self.named for name in states)
+        fits = all(
+            not n.said or factor_between(n.said, role.unit) is not None
+            for role, n in zip(inputs, left, strict=False)
+        )
+        several = len(inputs) > 1 and named
+        return len(inputs) == len(left) > 0 and known >= {*states} and fits and not several
 
     def _offered(self, role: _Role, left: Sequence[_Number]) -> Guess:
         """Return a role without a number: the commands, what has points, or what is possible."""
@@ -519,24 +531,16 @@ def _reckons(topic: TopicReport) -> bool:
     return topic.type.endswith("/Odometry") and moves and wheels
 
 
-def _alike(path: str, other: str) -> bool:
+def _alike(one: _Number, other: _Number) -> bool:
     """Check whether two numbers have the same name in their messages, or units that may agree."""
-    return path.split(".")[-2:] == other.split(".")[-2:] or unit_of(path) in ("", unit_of(other))
+    same = one.path.split(".")[-2:] == other.path.split(".")[-2:]
+    return same or unit_of(one.path) in ("", unit_of(other.path))
 
 
-@dataclass(frozen=True)
-class _Reading:
-    """Units in which a rate is the derivative of its position, except for its sign."""
-
-    q: float = 1.0  # factor of the position
-    w: float = 1.0  # factor of its rate, positive
-    about: int | None = None  # the signal whose unit is not the expected one: 0 or 1
-    unit: str = ""  # by their sizes
-
-    @property
-    def both(self) -> bool:
-        """Whether it says something of the two together."""
-        return self.unit == "the same"
+# What a position and its rate are read as: factors of the two, without the sign, the one of them
+# whose unit is not the expected one, if any, and that unit.
+_Reading = tuple[float, float, int | None, str]
+SAME_UNIT = "the same"
 
 
 def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Iterator[_Reading]:
@@ -547,19 +551,18 @@ def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Itera
         stated: the units that the log states for the two, "" for none.
         by: the factors from these to the model's units.
     """
-    tried = [
-        _Reading(),
-        _Reading(q=1 / DEGREES, about=0, unit="deg"),
-        _Reading(w=1 / DEGREES, about=1, unit="deg"),
+    tried: list[_Reading] = [
+        (1.0, 1.0, None, ""),
+        (1 / DEGREES, 1.0, 0, "deg"),
+        (1.0, 1 / DEGREES, 1, "deg"),
     ]
     if bool(stated[0]) != bool(stated[1]):  # the one unit is that of both
-        other = {"w": by[0], "about": 1} if stated[0] else {"q": by[1], "about": 0}
-        tried.append(_Reading(**other, unit="the same"))  # type: ignore[arg-type]
-    return (one for one in tried if abs(abs(slope) * one.w / one.q - 1) < SAME)
+        tried.append((1.0, by[0], 1, SAME_UNIT) if stated[0] else (by[1], 1.0, 0, SAME_UNIT))
+    return (one for one in tried if abs(abs(slope) * one[1] / one[0] - 1) < SAME)
 
 
 def _followed(
-    guesses: Mapping[str, Guess], pair: tuple[str, str], signals: Signals, table: _Table
+    guesses: Mapping[str, Guess], pair: tuple[str, str], table: _Table
 ) -> dict[str, Guess]:
     """Return a position and its rate with what their samples say of signs, units and each other.
 
@@ -570,7 +573,7 @@ def _followed(
     q, w = (guesses[name] for name in pair)
     if not (q.path and w.path):
         return {}
-    like, back = signals.follows(q.path, w.path), signals.follows(w.path, q.path)
+    like, back = table.signals.follows(q.path, w.path), table.signals.follows(w.path, q.path)
     by = table.factor(q.name, q.path), table.factor(w.name, w.path)
     slope, size = like.slope * by[1] / by[0], like.correlation
 
@@ -583,77 +586,26 @@ def _followed(
         why = found("start.follows", w.name, of=q.path, correlation=size, no=True)
         return {w.name: w.because(why, sure=False)} if size else {}
 
-    q, w = _in_units(q, w, like, by, table)
-    why = found("start.follows", w.name, of=q.path, correlation=size, opposite=slope < 0)
-    w = w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)
-    return {q.name: q, w.name: w}
-
-
-def _in_units(
-    q: Guess, w: Guess, like: Follows, by: tuple[float, float], table: _Table
-) -> tuple[Guess, Guess]:
-    """Return a position and its rate in the units that make them agree, and how sure they are."""
+    # In which units do they agree?
     stated = [table.stated.unit(one.path) for one in (q, w)]
-    slope = like.slope * by[1] / by[0]
     reading = next(_readings(slope, stated, by), None)
     if reading is None:
-        why = found("start.follows", w.name, of=q.path, slope=slope)
-        return q, w.because(why, sure=False)
-    if reading.about is not None:
-        names = (q.name, w.name)
-        about = names if reading.both else names[reading.about :][:1]
-        odd = found("start.unit", *about, unit=reading.unit, size=True)
-        q, w = (g.because(odd) if i == reading.about else g for i, g in enumerate((q, w)))
-    q = replace(q, scale=reading.q, sure=q.sure and reading.q == 1)
-    w = replace(w, scale=reading.w * float(np.sign(slope)))
+        w = w.because(found("start.follows", w.name, of=q.path, slope=slope), sure=False)
+    else:
+        q_by, w_by, odd, unit = reading
+        if odd is not None:
+            about = pair if unit == SAME_UNIT else (pair[odd],)
+            why = found("start.unit", *about, unit=unit, size=True)
+            q, w = (g.because(why) if i == odd else g for i, g in enumerate((q, w)))
+        q = replace(q, scale=q_by, sure=q.sure and q_by == 1)
+        w = replace(w, scale=w_by * float(np.sign(slope)))
 
-    # Each is as sure as the other if nothing else rivals with it.
-    alone = [not g.others and (g.name, g.path) not in table.doubted for g in (q, w)]
-    kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
-    same = min(abs(slope - 1), abs(like.slope - 1)) < SAME
-    sure = (kind and like.correlation > SURELY and same) or (w.sure and w.scale == 1)
-    q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))
-    return q, replace(w, sure=w.sure or (q.sure and alone[1]))
-
-
-def _by_steps(guesses: Mapping[str, Guess], model: Model, signals: Signals) -> dict[str, Guess]:
-    """Return the guesses after the model's steps have chosen among the inputs that are left."""
-    signals.read(p for g in guesses.values() for p in (g.path, *g.others) if p)
-    return {**guesses, **by_inputs(model, guesses, signals)}
-
-
-def _the_rest(
-    guesses: Mapping[str, Guess], model: Model, signals: Signals, table: _Table
-) -> dict[str, Guess]:
-    """Give inputs without a name the numbers that are left, if as many: in the log's order, unsure.
-
-    Only if the states are known, or are rates of those: a number that is left is no state then.
-    """
-    lost = [name for name in model.input_names if not guesses[name].path]
-    known = {name for name in model.state_names if guesses[name].path}
-    known |= {w for q, w in rate_states(model).items() if q in known}
-    used = {guess.path for guess in guesses.values()}
-    left = [n for n in table.numbers if n.moves and n.path not in used]
-    named = any((name, guesses[name].path) in table.named for name in model.state_names)
-    if (
-        not lost
-        or len(left) != len(lost)
-        or known < {*model.state_names}
-        or len(lost) > 1 < named + 1
-    ):
-        return dict(guesses)
-    pairs = list(zip(lost, left, strict=True))
-    if any(n.said and factor_between(n.said, model.inputs[name]) is None for name, n in pairs):
-        return dict(guesses)
-    paths = tuple(number.path for number in left)
-    more = {
-        name: replace(
-            guesses[name],
-            path=number.path,
-            others=tuple(path for path in paths if path != number.path),
-            reasons=(found("start.left", name, numbers=paths),),
-        )
-        for name, number in pairs
-    }
-    done = by_inputs(model, {**guesses, **more}, signals)
-    return {**guesses, **more} | {name: replace(one, sure=False) for name, one in done.items()}
+        # Each is as sure as the other if nothing else rivals with it.
+        alone = [not g.others and (g.name, g.path) not in table.doubted for g in (q, w)]
+        kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
+        same = min(abs(slope - 1), abs(like.slope - 1)) < SAME
+        sure = (kind and size > SURELY and same) or (w.sure and w.scale == 1)
+        q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))
+        w = replace(w, sure=w.sure or (q.sure and alone[1]))
+    why = found("start.follows", w.name, of=q.path, correlation=size, opposite=slope < 0)
+    return {q.name: q, w.name: w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)}

@@ -14,8 +14,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
 from grounded.units import UNITS
@@ -25,7 +23,6 @@ from grounded_trials.logs.stated_units import SLIDING, TURNING
 
 if TYPE_CHECKING:
     from grounded_trials.logs.inspection.guess import Guess
-    from grounded_trials.logs.inspection.relations import Signals
 
 AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
 PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}
@@ -50,8 +47,6 @@ NAMED, ORDERED, UNKNOWN, LESS = (
     1.5,
     0.2,
 )  # points of a joint's number; less of each further one
-ALIKE, CLEARLY = 0.9, 0.1  # least correlation of a command with an effort, and lead over others
-LATEST = 0.1  # [s] largest delay of an effort behind its command
 FULL_TURNS, LARGEST = 4 * math.pi, 720.0  # range that suggests degrees; largest angle in degrees
 FOLLOWED = 0.3  # of a command of several turns, that a state in rad reaches if it follows it
 DEFLECTED = re.compile(r"steer|rudder|aileron|elevator|flap|wheel_angle")  # follows no such state
@@ -279,52 +274,6 @@ def _there(log: LogReport) -> set[str]:
         for field in topic.fields
         if field.low != field.high or ".effort[" not in field.path
     }
-
-
-def by_efforts(
-    name: str,
-    joints: Mapping[str, tuple[str, ...]],
-    signals: Signals,
-    log: LogReport,
-) -> str:
-    """Return the number of an array that is the command of an input's joint, "" if unknown.
-
-    Each command of the array must correlate with one joint's measured effort, clearly more than
-    with the others.
-
-    Args:
-        name: of the input.
-        joints: see `joint_names`.
-        signals: reads the samples.
-        log: an inspected log.
-    """
-    there = _there(log)
-    for topic, names in joints.items():
-        own = [joint for joint in names if holds(name, joint)]
-        arrays, measured = (
-            commands(log, len(names)),
-            [f"{topic}.effort[{k}]" for k in range(len(names))],
-        )
-        if len(own) == 1 and len(arrays) == 1 and there.issuperset(measured):
-            sent = [f"{arrays[0]}[{k}]" for k in range(len(names))]
-            at = _goes_with(sent, measured, signals)[names.index(own[0])]
-            return "" if at is None else sent[at]
-    return ""
-
-
-def _goes_with(sent: Sequence[str], measured: Sequence[str], signals: Signals) -> list[int | None]:
-    """Return the index of the command for each effort; all None unless every one is clear."""
-    like, none = signals.lagged(sent, measured, LATEST), [None] * len(measured)
-    if like is None:
-        return [*none]
-    best = like.argmax(axis=0)
-    others = like.copy()
-    others[best, np.arange(len(measured))] = -1.0
-    own = like[best, np.arange(len(measured))]
-    rest = np.maximum(others.max(axis=0), others[best].max(axis=1))
-    if len(set(best.tolist())) < len(best) or (own < ALIKE).any() or (own - rest < CLEARLY).any():
-        return [*none]
-    return [int(k) for k in best]
 
 
 def commands(log: LogReport, count: int, plain: bool = False) -> list[str]:

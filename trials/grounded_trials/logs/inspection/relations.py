@@ -128,28 +128,25 @@ class Signals:
         step, (q, w) = gridded
         return follows(q, w, step)
 
-    def lagged(self, sent: Sequence[str], moved: Sequence[str], latest: float) -> Floats | None:
-        """Return the largest correlation of each command with each signal that may follow it.
+    def lagged(self, sent: str, moved: str, latest: float) -> float | None:
+        """Return the largest correlation of a command with what follows it.
 
         Args:
-            sent: paths of k commands.
-            moved: paths of m signals.
+            sent: path of the command.
+            moved: path of the signal that may follow it.
             latest: largest delay [s].
 
         Returns:
-            (k, m), -1 for constant ones; None if the signals don't overlap.
+            -1 for a constant one; None if the signals don't overlap.
         """
-        gridded = self.grid((*sent, *moved))
+        gridded = self.grid((sent, moved))
         if gridded is None:
             return None
-        k, (step, columns) = len(sent), gridded
-        u, y = np.array(columns[:k]), np.array(columns[k:])
-        found = np.full((k, len(moved)), -1.0)
+        step, (u, y) = gridded
         with np.errstate(invalid="ignore", divide="ignore"):
-            for late in range(1 + min(round(latest / step), u.shape[1] // 2)):
-                like = np.corrcoef(u[:, : u.shape[1] - late], y[:, late:])[:k, k:]
-                found = np.fmax(found, like)
-        return found
+            delays = range(1 + min(round(latest / step), len(u) // 2))
+            likes = [np.corrcoef(u[: len(u) - late], y[late:])[0, 1] for late in delays]
+        return float(np.nanmax([-1.0, *likes]))
 
     def rates(self, paths: Sequence[str]) -> dict[str, tuple[str, float]]:
         """Return which numbers are the rate of which: {position: (rate, factor of the rate)}.
