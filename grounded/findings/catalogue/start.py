@@ -82,10 +82,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "degrees": Entry(
         "note",
-        "{about} is in rad by the model[[, but goes from {low} to {high}]][[: {turns:.2g} turns]]",
-        "[[if you meant degrees, use `--to {about}={to}`]][[target? if in degrees, multiply it by "
-        "{scale:.8g}]][[!target? if in degrees,"
-        " set scale = {scale:.8g} in [log], of its rate too; [limits] are in rad]]",
+        "{about} is in rad by the model: {turns:.2g} turns",
+        "[[if you meant degrees, use `--to {about}={to}`]][[!to? if in degrees, multiply it by "
+        "{scale:.8g}]]",
     ),
     "no_start": Entry(
         "refuse",

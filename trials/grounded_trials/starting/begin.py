@@ -29,7 +29,7 @@ from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
+from grounded_trials.logs.inspection.joint_names import joint_names
 from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.log_files import column_units, kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
@@ -179,8 +179,6 @@ def begin(
         units = {**drawn.model.states, **drawn.model.inputs}
         states, commands = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
         drawn.with_gain((*states, *commands))
-        odd = perhaps_degrees((*states, *commands), drawn.model, clues.joints)
-        commands = [g.because(odd[g.name], sure=False) if g.name in odd else g for g in commands]
         slow = () if layout.rate or about_table(logs[0]).in_time_units else _in_seconds(report)
 
         # The control interval, and the ranges: zero is sent after a run, so limits must include it.
@@ -203,7 +201,6 @@ def begin(
         stood = held_first(made, columns, sent, step, ranges) or {}
         name, why = Path(log).name, drawn.why
         write_first(folder, made, step, columns, horizon, ranges, table, why, name, stood)
-        doubts = [odd[g.name] for g in states if g.name in odd]
         more = [*_on_own(report, (*states, *commands), made)] if own else []
         return Begun(
             workspace=str(folder),
@@ -216,7 +213,7 @@ def begin(
             inputs=tuple(commands),
             target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
             start=", ".join(f"{n} = {value:.4g}" for n, value in stood.items()) or "empty",
-            findings=(*notes, *drawn.notes, *slow, *doubts, *more, *note, *odd_run),
+            findings=(*notes, *drawn.notes, *slow, *more, *note, *odd_run),
             again=again if slow else (),
         )
 

@@ -293,7 +293,7 @@ def _in_degrees(case: _Case) -> Iterator[Finding]:
         if case.units.get(name) == "rad" and turns > TURNS:
             to = f"{math.radians(value):.4g}" if name in given else None
             scale = math.radians(1.0)
-            yield found("start.degrees", name, turns=turns, to=to, target=not to, scale=scale)
+            yield found("start.degrees", name, turns=turns, to=to, scale=scale)
 
 
 def _weighed_without_column(case: _Case) -> Iterator[Finding]:

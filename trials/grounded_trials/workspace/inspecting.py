@@ -13,7 +13,6 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guessed_table import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.inspection.joint_names import joint_names, perhaps_degrees
 from grounded_trials.logs.log_table import layout_of
 from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
@@ -112,12 +111,10 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
                 ", as this folder is no workspace: make one from the log, or name yours with -C DIR"
             )
         return Inspected(str(log), report, "", why, outside=not here)
-    joints = joint_names(report)
-    states, inputs = assigned(report, model.states, model.inputs, model, joints)
+    states, inputs = assigned(report, model.states, model.inputs, model)
     table = mapping_toml(states, inputs, simulated=report.simulated, layout=layout)
     mapping = workspace.log_mapping
     odd = tuple(one.sentence for one in no_angles(model, mapping))
-    odd += tuple(one.sentence for one in perhaps_degrees(states, model, joints).values())
     known = {*mapping.states, *mapping.inputs} if mapping else set[str]()
     mapped = {*model.states, *model.inputs} <= known
     ran_nothing = not workspace.candidate_ids()

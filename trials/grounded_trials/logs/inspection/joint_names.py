@@ -8,21 +8,18 @@ its joints, too, and holds what they did beside what they should do: `/state.fee
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from grounded.findings import Finding, Quantity, found
-from grounded.model import Model
-from grounded.units import UNITS
+from grounded.findings import Finding, found
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.stated_units import SLIDING, TURNING
 
 if TYPE_CHECKING:
-    from grounded_trials.logs.inspection.guess import Guess
+    pass
 
 AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
 PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}
@@ -30,7 +27,6 @@ LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist",
 LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
 WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # order of joints within one part
 SIDES = ("left", "right", "front", "rear")  # words that indicate several limbs
-ROLLS = re.compile("wheel|caster|track|rotor|prop|crank|spindle")  # joints that turn endlessly
 SLIDES = {  # words of prismatic joints, in metres
     *("trolley", "cart", "carriage", "slide", "slider", "rail", "prismatic", "linear"),
     *("gantry", "lift", "elevator", "telescope"),
@@ -47,9 +43,6 @@ NAMED, ORDERED, UNKNOWN, LESS = (
     1.5,
     0.2,
 )  # points of a joint's number; less of each further one
-FULL_TURNS, LARGEST = 4 * math.pi, 720.0  # range that suggests degrees; largest angle in degrees
-FOLLOWED = 0.3  # of a command of several turns, that a state in rad reaches if it follows it
-DEFLECTED = re.compile(r"steer|rudder|aileron|elevator|flap|wheel_angle")  # follows no such state
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
@@ -227,43 +220,6 @@ def _commanded(
     paths = [*(f"{array}[{at}]" for array in arrays), *own]
     paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
     return {path: Joint(NAMED - LESS * k, why) for k, path in enumerate(paths)}
-
-
-def perhaps_degrees(
-    guesses: Sequence[Guess],
-    model: Model,
-    joints: Mapping[str, tuple[str, ...]],
-) -> dict[str, Finding]:
-    """Return a finding on each signal in rad by the model that spans turns: it may be in degrees.
-
-    A command of more than a turn, unless a state comes close to it; a joint other than a wheel that
-    spans full turns, against the ROS conventions; an angle that a log would wrap.
-
-    Args:
-        guesses: of states and inputs, with the ranges of their numbers.
-        model: with their units.
-        joints: see `joint_names`.
-    """
-    called = {
-        number_of(t, "position", i): j for t, names in joints.items() for i, j in enumerate(names)
-    }
-    units, spans = {**model.states, **model.inputs}, {g.name: g.extent for g in guesses}
-    peaks = {n: max(map(abs, e)) for n, e in spans.items() if e and units[n] == "rad"}
-    moved = max((peak for name, peak in peaks.items() if name in model.states), default=0.0)
-    doubts = {}
-    for one in (g for g in guesses if g.name in peaks):
-        peak, joint, (low, high) = peaks[one.name], called.get(one.path, ""), one.extent or (0, 0)
-        if one.name in model.inputs:
-            several = moved >= FOLLOWED * peak and not DEFLECTED.search(one.name.lower())
-            odd = peak > 2 * math.pi and not several
-        else:
-            plain = (bool(joint) and not ROLLS.search(joint.lower())) or one.name in model.angles
-            odd = plain and high - low > FULL_TURNS and peak <= LARGEST
-        if odd:
-            ends, by = (Quantity(end, "rad") for end in (low, high)), UNITS["deg"][1]
-            first, last = ends
-            doubts[one.name] = found("start.degrees", one.name, low=first, high=last, scale=by)
-    return doubts
 
 
 def _there(log: LogReport) -> set[str]:
