@@ -21,22 +21,7 @@ ENTRIES: dict[str, Entry] = {
         "{of}[[opposite?  with the OPPOSITE SIGN]][[, correlation {correlation:.3f}]]"
         "[[, {slope:.3g} times as large]]",
     ),
-    "exchanged": Entry(
-        "note",
-        "{about} look exchanged: the first follows the derivative of the second, correlation "
-        "{correlation:.3f}, with the right sign and size",
-        "if so, exchange these paths",
-    ),
-    "pose": Entry(
-        "note",
-        "measured independently of the wheels, from whose speed the pose of {about} is most "
-        "likely integrated",
-    ),
-    "still": Entry(
-        "note",
-        "{about} never {about:changes/change} in this log",
-        "[[empty? there are no messages: record the commands]]",
-    ),
+    "still": Entry("note", "{about} never {about:changes/change} in this log"),
     "left": Entry(
         "note",
         "no name matches; {numbers} {numbers:is/are} left[[only? , by unit]][[!only? , in the "
@@ -64,9 +49,6 @@ ENTRIES: dict[str, Entry] = {
         "[[every? [task] dt (--dt) sets another]][[apart? if the times are in ms or us, end that "
         "column's name "
         "with _ms or _us and create the workspace again in another folder]]",
-    ),
-    "encoder": Entry(
-        "note", "of '{joint}', times the radius r", "enter yours here and in model.py"
     ),
     # what the file of a model says
     "unmoved": Entry(

@@ -41,7 +41,6 @@ from grounded_trials.starting.interval import interval_of, too_coarse
 from grounded_trials.starting.kinds import (
     KINDS,
     Clues,
-    by_encoders,
     kind_in,
     moving,
     skeleton,
@@ -244,10 +243,6 @@ class _Draft:
         if not (kind or any(g.path for g in self.matched[0])):
             self.kind, self.why = "generic", f"none of {self.kind}"
             self._take(skeleton("generic", self.clues, self.named))
-        if self.kind == "balance":
-            states, inputs = self.matched
-            wheel = self.model.params["r"].value
-            self.matched = by_encoders(states, self.clues, wheel), inputs
 
     def with_gain(self, signals: Sequence[Guess]) -> None:
         """Write the gain that the log shows into a skeleton that has one."""

@@ -10,12 +10,10 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 
 from grounded.checks import refused, unknown
-from grounded.findings import found as found_
 from grounded.units import factor_between
-from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
-from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS, POSES
+from grounded_trials.logs.inspection.names import NAMES_BY_UNIT, PARTS
 from grounded_trials.logs.inspection.relations import Signals
 from grounded_trials.logs.stated_units import Stated, bare_command, command_unit, unit_in_name
 from grounded_trials.starting.pushed import pushed, pushed_by
@@ -318,19 +316,6 @@ class Clues:
                 return topic.topic
         return ""
 
-    @property
-    def encoders(self) -> str:
-        """The JointState topic whose joints are all wheels, "" if positions come with it."""
-        driven = any(
-            one.path.endswith(("position.x", "twist.linear.x")) and one.low != one.high
-            for topic in self.log.topics
-            if topic.type.endswith(("/Odometry", *POSES))
-            for one in topic.fields
-        )
-        wheels = (t for t in self.joints if t not in self.arms)
-        turned = (t for t in wheels if f"{t}.position[0]" in self.log.moving)
-        return "" if driven else next(turned, "")
-
 
 EVIDENCE: tuple[tuple[str, Callable[[Clues], str]], ...] = (  # the first that a log has decides
     ("car", lambda clues: clues.ackermann),
@@ -357,21 +342,6 @@ def kind_in(clues: Clues) -> tuple[str, str]:
     return next((kind, why) for kind, of in EVIDENCE if (why := of(clues)))
 
 
-def by_encoders(states: Sequence[Guess], clues: Clues, r: float) -> Sequence[Guess]:
-    """Give x and v of a balancing robot the first wheel's angle and speed, times a radius r [m]."""
-    if not (where := clues.encoders):
-        return states
-    log, wheel = clues.log, clues.joints[where][0]
-    ends, guesses = {"x": "position", "v": "velocity"}, []
-    for guess in states:
-        path = f"{where}.{ends.get(guess.name, '')}[0]"
-        if path in log.moving:
-            why, clock = found_("start.encoder", path, joint=wheel), log.clock(log.topic_of(path))
-            guess = Guess(guess.name, path, clock, False, (), log.number(path), (why,), r)
-        guesses.append(guess)
-    return guesses
-
-
 def skeleton(kind: str, clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     """Return the skeleton of a kind with the log's names; `inputs` are those of a generic one."""
     if kind == "generic":
@@ -381,7 +351,7 @@ def skeleton(kind: str, clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
         return arm(from_base(joints) if joints else ("joint1", "joint2"))
     if kind == "drone":
         return _drone(clues)
-    plain = fixed("balance_by_encoders" if kind == "balance" and clues.encoders else kind)
+    plain = fixed(kind)
     if kind == "car" and not clues.ackermann:
         return _car(plain, clues)
     if kind == "rover":

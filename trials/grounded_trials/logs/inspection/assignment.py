@@ -6,7 +6,7 @@ Every number has points for every role, the sum of named evidence:
     unit        stated by the log, or by the ROS message type              (`stated_units`)
     kind        a command for an input, what is measured for a state; a number that changes
     joint       the names and the order of joints                          (`joint_names`)
-    home        states come from one message rather than from many
+    home        states come from one message rather than from many, and often
     derivative  where the model has dq/dt = w, w follows q in the samples  (`relations`)
     motion      the model's steps, among assignments that are left         (`steps`)
 
@@ -67,9 +67,7 @@ UNNAMED_BESIDE, UNNAMED_AT_ALL = (
     60,
 )  # most numbers without a name that are tried as rates beside known ones; at all
 LATEST = 0.5  # [s] a command is sought up to this long before the angle that follows it
-AS_OFTEN = 0.5  # of the wheel odometry's rate: a pose at this rate is preferred to the odometry's
-STATED, HOME, POSE, ALIVE, CAP = 1.8, 0.75, 2.2, -3.0, 5.0  # points, see `_Table`
-_POSE = ("position.x", "position.y", "@rpy.yaw")
+STATED, HOME, CAP = 1.8, 0.75, 5.0  # points, see `_Table`
 
 
 @dataclass(frozen=True)
@@ -248,34 +246,13 @@ class _Table:
                 self.named.add((name, path))
 
     def _at_home(self) -> None:
-        """Count that states come from one message, that a pose is measured, and what changes."""
+        """Count that states come from one message, and often."""
         fitting = {role.name: self._fitting(role.name) for role in self.roles if not role.sent}
         homes = Counter(t for some in fitting.values() for t in {n.topic.topic for n in some})
-        bonus = []
         for name, numbers in fitting.items():
-            row = self.points[self.row[name]]
-            best = max((row[self.at[n.path]] for n in numbers), default=0.0)
-            reckoned = {k: n for n in numbers if (k := _pose(n.path)) and _reckons(n.topic)}
-            for number in numbers:
-                topic, here = number.topic, row[self.at[number.path]]
-                points = HOME * homes[topic.topic] + 0.1 * float(np.log10(1 + topic.rate_hz))
-                if (wheels := reckoned.get(_pose(number.path))) and topic.type.endswith(
-                    words.POSES
-                ):
-                    often = topic.rate_hz >= AS_OFTEN * wheels.topic.rate_hz
-                    if often and here > best - SURE_LEAD:
-                        points += POSE
-                        self.add(name, number.path, 0, found("start.pose", wheels.topic.topic))
-                        self.doubted.add((name, number.path))
-                still = not number.moves and number.field.low is not None
-                for one in (n for n in numbers if still and n.moves and _alike(n, number)):
-                    if here + points >= row[self.at[one.path]] + HOME * homes[one.topic.topic]:
-                        self.add(name, one.path, 0, found("start.still", number.path))
-                        self.doubted.add((name, one.path))
-                points += ALIVE * any(still and n.moves and _alike(n, number) for n in numbers)
-                bonus.append((name, number.path, points))
-        for name, path, points in bonus:
-            self.add(name, path, points)
+            for topic, path in [(n.topic, n.path) for n in numbers]:
+                rate = 0.1 * float(np.log10(1 + topic.rate_hz))
+                self.add(name, path, HOME * homes[topic.topic] + rate)
 
     def _fitting(self, name: str) -> list[_Number]:
         """Return the numbers that would be proposed for a role."""
@@ -489,12 +466,7 @@ class _Table:
         some = some or [n for n in self.numbers if (role.name, n.path) in self.named]
         some = some or [n for n in may if n.path in possible and not n.said]
         some.sort(key=lambda n: -float(row[self.at[n.path]]))
-        empty = [t.topic for t in self.log.topics if not t.messages]
-        empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
-        why = (found("start.still", *empty, empty=True),) if empty and role.sent else ()
-        return Guess(
-            role.name, "", "", False, tuple(n.path for n in some)[:MOST_CANDIDATES], None, why
-        )
+        return Guess(role.name, "", "", False, tuple(n.path for n in some)[:MOST_CANDIDATES])
 
     def finished(self, guess: Guess) -> Guess:
         """Return a guess with its clock, its range, and the unit that the log states."""
@@ -518,23 +490,6 @@ class _Table:
 def _capped(like: Follows) -> float:
     """Return the points of a relation: beyond CAP more of them only break ties."""
     return min(like.points, CAP) + 0.01 * like.points
-
-
-def _pose(path: str) -> str:
-    return next((one for one in _POSE if path.endswith(one)), "")
-
-
-def _reckons(topic: TopicReport) -> bool:
-    """Check whether a topic's pose is most likely integrated from its own speed."""
-    moves = any(f.path.endswith("twist.linear.x") and f.low != f.high for f in topic.fields)
-    wheels = not words.NO_WHEELS.search(topic.topic.lower())
-    return topic.type.endswith("/Odometry") and moves and wheels
-
-
-def _alike(one: _Number, other: _Number) -> bool:
-    """Check whether two numbers have the same name in their messages, or units that may agree."""
-    same = one.path.split(".")[-2:] == other.path.split(".")[-2:]
-    return same or unit_of(one.path) in ("", unit_of(other.path))
 
 
 # What a position and its rate are read as: factors of the two, without the sign, the one of them
@@ -564,24 +519,13 @@ def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Itera
 def _followed(
     guesses: Mapping[str, Guess], pair: tuple[str, str], table: _Table
 ) -> dict[str, Guess]:
-    """Return a position and its rate with what their samples say of signs, units and each other.
-
-    Where a load swings, its angular acceleration is opposite to the angle: with the columns
-    exchanged the rate follows the derivative of the position, too, but with the opposite sign or
-    another size. Only the right order has both right.
-    """
+    """Return a position and its rate with what their samples say of signs and units."""
     q, w = (guesses[name] for name in pair)
     if not (q.path and w.path):
         return {}
-    like, back = table.signals.follows(q.path, w.path), table.signals.follows(w.path, q.path)
+    like = table.signals.follows(q.path, w.path)
     by = table.factor(q.name, q.path), table.factor(w.name, w.path)
     slope, size = like.slope * by[1] / by[0], like.correlation
-
-    # Which is the rate of which?
-    crossed = back.fits and not (abs(slope - 1) < SAME and size > FOLLOWS)
-    exchanged = found("start.exchanged", q.path, w.path, correlation=back.correlation)
-    if crossed and not (size < -SURELY and abs(slope + 1) < SAME):
-        return {q.name: replace(q, sure=False), w.name: w.because(exchanged, sure=False)}
     if abs(size) < FOLLOWS:
         why = found("start.follows", w.name, of=q.path, correlation=size, no=True)
         return {w.name: w.because(why, sure=False)} if size else {}
@@ -608,4 +552,4 @@ def _followed(
         q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))
         w = replace(w, sure=w.sure or (q.sure and alone[1]))
     why = found("start.follows", w.name, of=q.path, correlation=size, opposite=slope < 0)
-    return {q.name: q, w.name: w.because(why, *[exchanged] * crossed, sure=w.sure and size > 0)}
+    return {q.name: q, w.name: w.because(why, sure=w.sure and size > 0)}

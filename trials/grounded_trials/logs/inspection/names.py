@@ -74,9 +74,6 @@ PARTS = re.compile(
     r"|(orientation|rotation|quaternion)\.[xyzw]$|\.q(_d)?\[\d\]$"
 )
 POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
-NO_WHEELS = re.compile(  # topics with odometry messages that is not from wheels
-    "mocap|vicon|optitrack|qualisys|truth|filter|fused|ekf|gps|gnss|slam|lidar|visual|vio"
-)
 _WORD = re.compile(r"[a-z]+")
 _FLAT = re.compile(r"_(linear|angular)_(?=[xyz]$)")  # a Twist in a table: cmd_vel_linear_x
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
