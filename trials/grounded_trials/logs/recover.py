@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import IO, Any
 
@@ -95,20 +96,19 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
 
 def _recover(source: Path, target: Path) -> Recovery:
     with open_log(source) as stream:
-        head = stream.read(HEAD)
-        stream.seek(0)
-        salvage = Salvage(stream, str(source))
-        try:
-            with target.open("xb") as out:
-                copy = _Copy(out, compressed=any(name in head for name in COMPRESSED))
-                for record in salvage.records():
-                    copy.add(record)
-                copy.finish()
-            sync_folder(target.parent)
-        except OSError as error:
-            raise GroundedError(
-                found("file.unwritable", str(target), why=str(error.strerror))
-            ) from error
+        data = mmap(stream.fileno(), 0, access=ACCESS_READ)
+    head, salvage = data[:HEAD], Salvage(data, str(source))
+    try:
+        with target.open("xb") as out:
+            copy = _Copy(out, compressed=any(name in head for name in COMPRESSED))
+            for record in salvage.records():
+                copy.add(record)
+            copy.finish()
+        sync_folder(target.parent)
+    except OSError as error:
+        raise GroundedError(
+            found("file.unwritable", str(target), why=str(error.strerror))
+        ) from error
     if not copy.anything:
         raise GroundedError(found("file.no_message", str(source)))
     losses = salvage.losses[:MOST_LOSSES]

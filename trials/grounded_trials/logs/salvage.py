@@ -10,8 +10,9 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Iterator
+from functools import cached_property
+from mmap import mmap
 from struct import Struct
-from typing import BinaryIO
 
 import numpy as np
 
@@ -37,11 +38,8 @@ from grounded_trials.formats.mcap_records import (
     chunk_content,
     decompress,
 )
-from grounded_trials.formats.mcap_walk import (
-    again,
-    chunk_records,
-    message_positions,
-)
+from grounded_trials.formats.mcap_walk import again, chunk_records, message_positions
+from grounded_trials.formats.messages import Ints
 
 _HEAD = Struct("<BQ")
 _SPAN = Struct("<QQ")  # a chunk's first and last time
@@ -49,7 +47,6 @@ _NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a 
 _NAMES |= {9: "an attached file", 12: "a table of metadata"}
 BATCH = 2**22  # [bytes] of messages outside chunks passed on together
 CHAIN = 3  # consecutive plausible records after which a place is accepted
-_BLOCKS = (2**9, 2**20)  # [bytes] searched at once; growing, since there may be many gaps
 
 
 class Salvage:
@@ -62,9 +59,8 @@ class Salvage:
         unverified: number of saved messages without a valid checksum.
     """
 
-    def __init__(self, stream: BinaryIO, name: str) -> None:
-        self.stream, self.name = stream, name
-        self.size = stream.seek(0, 2)
+    def __init__(self, data: bytes | mmap, name: str) -> None:
+        self.data, self.name, self.size = data, name, len(data)
         self.losses: list[Finding] = []
         self.lost_messages: Counter[int] = Counter()
         self.dropped: list[tuple[int, int]] = []
@@ -82,11 +78,10 @@ class Salvage:
         pos = self._first()
         dropped_chunk, before = False, 0  # the record before, 0 after a gap
         while pos is not None and pos < self.size - len(MAGIC):
-            end = plausible(self.stream, self.size, pos)
+            end = self._end_of(pos)
             if end is None:
                 yield from self._flush()
-                cut = self._is_cut_chunk(pos)
-                after = None if cut else next_chain(self.stream, self.size, pos + 1)
+                after = None if self._is_cut_chunk(pos) else self._next_chain(pos + 1)
                 if after is None:
                     yield from self._cut(pos)
                     return
@@ -119,14 +114,14 @@ class Salvage:
         return found("file.cut", byte=self.size, index=int(self._ended))
 
     def _first(self) -> int | None:
-        if read_at(self.stream, 0, 8) == MAGIC:
+        if self.data[:8] == MAGIC:
             self._crc = zlib.crc32(MAGIC)
             return len(MAGIC)
         self.losses.append(found("file.lost", part="its beginning"))
-        return next_chain(self.stream, self.size, 0)
+        return self._next_chain(0)
 
     def _read(self, pos: int, end: int) -> tuple[int, bytes]:
-        record = read_at(self.stream, pos, end - pos)
+        record = self.data[pos:end]
         if record[0] == DATA_END:
             self._data_end(record)
         self._crc = zlib.crc32(record, self._crc)
@@ -204,14 +199,54 @@ class Salvage:
 
     def _is_cut_chunk(self, pos: int) -> bool:
         """Check whether an intact chunk begins here that is cut off by the end of the file."""
-        start = read_at(self.stream, pos, 9 + 64)
+        start = self.data[pos : pos + 9 + 64]
         if len(start) < 49 or start[0] != CHUNK:
             return False
         return is_chunk(start[9:], int.from_bytes(start[1:9], "little"))
 
+    def _end_of(self, pos: int) -> int | None:
+        """Return where the record there ends; None if there can't be one."""
+        if self.size - pos < 9:
+            return None
+        opcode, length = _HEAD.unpack_from(self.data, pos)
+        end = pos + 9 + int(length)
+        short = opcode == MESSAGE and length < MESSAGE_HEADER
+        if opcode == 0 or opcode > DATA_END or end > self.size or short:
+            return None
+        if opcode == CHUNK and not is_chunk(self.data[pos + 9 : pos + 73], int(length)):
+            return None
+        return end
+
+    @cached_property
+    def _places(self) -> Ints:
+        """Where a record may begin: an opcode there, and a length below 2^32."""
+        octets = np.frombuffer(self.data, dtype=np.uint8)
+        count = max(len(octets) - 8, 0)
+        maybe = (octets[:count] > 0) & (octets[:count] <= DATA_END)
+        for i in range(5, 9):
+            maybe &= octets[i : count + i] == 0
+        return np.flatnonzero(maybe)
+
+    def _next_chain(self, start: int) -> int | None:
+        """Return the first offset from `start` on with a chain of records, None if there is none."""
+        after = self._places[np.searchsorted(self._places, start) :]
+        return next((int(at) for at in after if self._is_chain(int(at))), None)
+
+    def _is_chain(self, pos: int) -> bool:
+        if self.data[pos] == CHUNK:
+            return self._end_of(pos) is not None
+        for _ in range(CHAIN):
+            end = self._end_of(pos)
+            if end is None:
+                return False
+            if end == self.size - len(MAGIC) and self.data[end:] == MAGIC:
+                return True
+            pos = end
+        return True
+
     def _cut(self, pos: int) -> Iterator[Record]:
         """Yield the intact parts of the record at `pos`, in which the file ends."""
-        rest = read_at(self.stream, pos, self.size - pos)
+        rest = self.data[pos:]
         saved = 0
         if len(rest) > 49 and rest[0] == CHUNK:
             for record in self._cut_chunk(rest[9:]):
@@ -237,30 +272,8 @@ class Salvage:
             return
 
     def _tail(self, end: int) -> None:
-        if read_at(self.stream, end, 9) != MAGIC:
+        if self.data[end : end + 9] != MAGIC:
             self.losses.append(found("file.lost", part="its end"))
-
-
-def read_at(stream: BinaryIO, offset: int, count: int) -> bytes:
-    """Read `count` bytes of a file, fewer at its end."""
-    stream.seek(offset)
-    return stream.read(count)
-
-
-def plausible(stream: BinaryIO, size: int, offset: int) -> int | None:
-    """Return where the record at `offset` ends; None if there can't be one."""
-    head = read_at(stream, offset, 9)
-    if len(head) < 9:
-        return None
-    opcode, length = _HEAD.unpack(head)
-    end = offset + 9 + int(length)
-    if opcode == 0 or opcode > DATA_END or end > size:
-        return None
-    if opcode == MESSAGE and length < MESSAGE_HEADER:
-        return None
-    if opcode == CHUNK and not is_chunk(read_at(stream, offset + 9, 64), int(length)):
-        return None
-    return end
 
 
 def is_chunk(start: bytes, length: int) -> bool:
@@ -271,34 +284,3 @@ def is_chunk(start: bytes, length: int) -> bool:
     if name > 8 or start[32 : 32 + name] not in (b"", b"zstd", b"lz4"):
         return False
     return int.from_bytes(start[32 + name : 40 + name], "little") == length - 40 - name
-
-
-def next_chain(stream: BinaryIO, size: int, start: int) -> int | None:
-    """Return the first offset from `start` on with a chain of records; None if there is none."""
-    block, count = start, _BLOCKS[0]
-    while block < size:
-        data = np.frombuffer(read_at(stream, block, count + 8), dtype=np.uint8)
-        if len(data) < 9:
-            return None
-        opcodes = data[: len(data) - 8]
-        maybe = (opcodes > 0) & (opcodes <= DATA_END)
-        for i in range(5, 9):  # lengths are below 2^32
-            maybe &= data[i : len(data) - 8 + i] == 0
-        for i in np.flatnonzero(maybe[:count]).tolist():
-            if _is_chain(stream, size, block + i):
-                return int(block + i)
-        block, count = block + count, min(8 * count, _BLOCKS[1])
-    return None
-
-
-def _is_chain(stream: BinaryIO, size: int, offset: int) -> bool:
-    if read_at(stream, offset, 1) == bytes([CHUNK]):
-        return plausible(stream, size, offset) is not None
-    for _ in range(CHAIN):
-        end = plausible(stream, size, offset)
-        if end is None:
-            return False
-        if end == size - len(MAGIC) and read_at(stream, end, len(MAGIC)) == MAGIC:
-            return True
-        offset = end
-    return True
