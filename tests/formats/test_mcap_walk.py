@@ -34,7 +34,7 @@ from shared_data import data, files, needs_data
 def plain(source: bytes) -> list[Any]:
     """What the walk finds, in the words of the conformance suite's expected records."""
     found: list[Any] = []
-    for r in read_records(io.BytesIO(source), "file"):
+    for r in read_records(source, "file"):
         if isinstance(r, Header):
             found.append(("Header", r.library, r.profile))
         elif isinstance(r, Schema):
@@ -156,7 +156,7 @@ def test_every_way_to_write(chunked: bool, compression: CompressionType, crcs: b
     )
     messages = [r for r in plain(source) if r[0] == "Message"]
     assert [m[3] for m in messages] == list(range(100))
-    *_, end = read_records(io.BytesIO(source), "file")
+    *_, end = read_records(source, "file")
     assert isinstance(end, End) and end.data_crc is crcs
 
 

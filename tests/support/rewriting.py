@@ -24,7 +24,7 @@ def with_metadata(source: bytes, key: str, value: str | None) -> bytes:
     copy = McapWriter(stream, Header("", "grounded"))
     schemas: dict[int, Schema] = {}
     numbers: dict[int, int] = {}
-    for r in read_records(io.BytesIO(source), "file"):
+    for r in read_records(source, "file"):
         if isinstance(r, Metadata):
             table = {k: v for k, v in r.data.items() if k != key}
             copy.metadata(r.name, table if value is None else {**table, key: value})

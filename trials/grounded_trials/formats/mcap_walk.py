@@ -14,9 +14,9 @@ takes 40 ms.
 
 from __future__ import annotations
 
-import io
 import zlib
 from collections.abc import Iterator
+from mmap import ACCESS_READ, mmap
 from struct import Struct
 from typing import Any, BinaryIO
 
@@ -45,7 +45,8 @@ from grounded_trials.formats.mcap_records import (
     chunk_content,
 )
 
-BLOCK = 4 * 2**20  # [bytes] read at a time
+Data = bytes | mmap
+BLOCK = 4 * 2**20  # [bytes] of messages in a batch
 SMALL_CHUNK = 2**16  # [bytes] chunks smaller than this are joined ...
 TOGETHER = 2**20  # [bytes] ... up to this size
 BATCH_MESSAGES = 250_000  # messages in a batch
@@ -81,11 +82,17 @@ class DamagedFile(GroundedError):
         super().__init__(found(code, name, then=then, byte=offset, **facts))
 
 
-def read_records(source: BinaryIO | bytes, name: str, *, packed: bool = True) -> Iterator[Record]:
-    """Yield the records of an MCAP stream in order, ending with `End`.
+def mapped(stream: BinaryIO) -> Data:
+    """Return the bytes of an open file as they are read, without copying."""
+    empty = not stream.seek(0, 2)
+    return b"" if empty else mmap(stream.fileno(), 0, access=ACCESS_READ)
+
+
+def read_records(data: Data, name: str, *, packed: bool = True) -> Iterator[Record]:
+    """Yield the records of an MCAP file in order, ending with `End`.
 
     Args:
-        source: a seekable binary file, read from its beginning, or the bytes of one.
+        data: the file's bytes, see `mapped`.
         name: of the file, for messages.
         packed: whether chunks may be compressed; if not, reading takes time and memory in
             proportion to the size of the file.
@@ -93,83 +100,55 @@ def read_records(source: BinaryIO | bytes, name: str, *, packed: bool = True) ->
     Raises:
         DamagedFile: if it is not a complete, undamaged MCAP file.
     """
-    yield from _Walk(source, name, packed).records()
+    yield from _Walk(data, name, packed).records()
 
 
 class _Walk:
-    """One pass over a file; `buffer[pos:]` has been read, but not used yet."""
+    """One pass over a file, up to `pos`."""
 
-    def __init__(self, source: BinaryIO | bytes, name: str, packed: bool) -> None:
-        self.packed = packed
-        self.buffer, self.pos, self.base = b"", 0, 0
-        if isinstance(source, bytes):
-            self.buffer, source = source, io.BytesIO()
-        self.stream, self.name = source, name
-        self.size = len(self.buffer) or source.seek(0, 2)
-        source.seek(0)
-        self.crc, self.crc_pos = 0, 0  # of the bytes up to buffer[crc_pos]
+    def __init__(self, data: Data, name: str, packed: bool) -> None:
+        self.data, self.name, self.packed = data, name, packed
+        self.pos, self.size = 0, len(data)
+        self.summary = 0  # where the summary begins
         self.data_crc: bool | None = None  # None: still in the data section
         self.defined: dict[tuple[type, int], Schema | Channel] = {}
         self.small: list[bytes] = []  # the contents of small chunks, and the messages in them
         self.small_size, self.positions = 0, list[int]()
         self.messages = False  # a message, or a chunk of them, has begun
 
-    @property
-    def offset(self) -> int:
-        return self.base + self.pos
-
     def damaged(
         self, what: str, where: str = "", why: str = "", offset: int | None = None
     ) -> DamagedFile:
-        at = self.offset if offset is None else offset
+        at = self.pos if offset is None else offset
         return DamagedFile(self.name, at, what, where, why)
 
-    def cut_off(self, what: str) -> DamagedFile:
-        """Return the error for a file that ends too early: there is nothing to save before data."""
-        return DamagedFile(self.name, self.size, "cut", what, lost=not self.messages)
-
-    def fold(self) -> int:
-        """Return the CRC of everything used so far."""
-        self.crc = zlib.crc32(memoryview(self.buffer)[self.crc_pos : self.pos], self.crc)
-        self.crc_pos = self.pos
-        return self.crc
+    def checksum(self, start: int) -> int:
+        """Return the CRC from `start` to here."""
+        return zlib.crc32(memoryview(self.data)[start : self.pos])
 
     def need(self, count: int, what: str) -> None:
-        """Make `count` unused bytes available at buffer[pos]."""
-        if len(self.buffer) - self.pos >= count:
-            return
-        if self.offset + count > self.size:
-            raise self.cut_off(what)
-        self.fold()
-        self.base += self.pos
-        parts = [self.buffer[self.pos :]]
-        have = len(parts[0])
-        while have < count:
-            block = self.stream.read(max(BLOCK, count - have))
-            if not block:
-                raise self.cut_off(what)
-            parts.append(block)
-            have += len(block)
-        self.buffer, self.pos, self.crc_pos = b"".join(parts), 0, 0
+        """Check that the file has so many bytes more; before its first message none is saved."""
+        if self.pos + count > self.size:
+            raise DamagedFile(self.name, self.size, "cut", what, lost=not self.messages)
 
     def records(self) -> Iterator[Record]:
         self._magic()
         while True:
             self.need(9, "a record's head")
-            opcode, length = _HEAD.unpack_from(self.buffer, self.pos)
+            opcode, length = _HEAD.unpack_from(self.data, self.pos)
             self.messages |= opcode in (CHUNK, MESSAGE)
             self.need(9 + length, _NAMES.get(opcode, f"a record of type {opcode}"))
             if self.data_crc is None and opcode in PARSED:
                 if opcode != CHUNK:
                     yield from self._together()
                 if opcode == MESSAGE:
-                    yield self._run_of_messages()
+                    yield self._run_of_messages(9 + length)
                     continue
             elif opcode not in (DATA_END, FOOTER):  # an index, or part of the summary
                 self.pos += 9 + length
                 continue
-            at, start = self.offset, self.pos + 9
-            content = memoryview(self.buffer)[start : start + length]
+            at, start = self.pos, self.pos + 9
+            content = memoryview(self.data)[start : start + length]
             if opcode == DATA_END and self.data_crc is None:
                 yield from self._together()
                 self._data_end(content)
@@ -182,21 +161,21 @@ class _Walk:
                 yield from self._data_record(opcode, content, at)
 
     def _magic(self) -> None:
-        head = self.buffer[:8] or self.stream.read(8)
-        self.stream.seek(0)
-        if head != MAGIC:
+        if (head := self.data[:8]) != MAGIC:
             what = "empty" if not head else "cut" if MAGIC.startswith(head) else "other"
             raise DamagedFile(self.name, 0, what, "its first 8 bytes", lost=True)
-        self.need(8, "its first 8 bytes")
-        self.pos += 8
+        self.pos = 8
 
-    def _run_of_messages(self) -> Messages:
-        """Return all consecutive message records in the buffer."""
+    def _run_of_messages(self, first: int) -> Messages:
+        """Return consecutive message records: a block of them, at least the first."""
+        start, end = self.pos, min(self.size, self.pos + max(first, BLOCK))
+        block = self.data[start:end]
         try:
-            positions, self.pos = message_positions(self.buffer, self.pos, len(self.buffer))
+            positions, stop = message_positions(block, 0, len(block))
         except BadRecord as error:
             raise self.damaged("record", "message", error.finding.what) from None
-        return self._in_calendar(batch(self.buffer, positions))
+        self.pos += stop
+        return self._in_calendar(batch(block, positions))
 
     def _in_calendar(self, messages: Messages) -> Messages:
         if len(messages) and messages.log_times.min() < 0:
@@ -251,11 +230,10 @@ class _Walk:
 
     def _data_end(self, content: memoryview) -> None:
         stated = Fields(content).uint(32) if len(content) >= 4 else 0
-        if stated and stated != self.fold():
+        if stated and stated != self.checksum(0):
             raise self.damaged("checksum", "the data section")
         self.data_crc = bool(stated)
-        start = self.pos + 9 + len(content)
-        self.crc, self.crc_pos = 0, start
+        self.summary = self.pos + 9 + len(content)
 
     def _footer(self, content: memoryview) -> None:
         if self.data_crc is None:
@@ -265,15 +243,15 @@ class _Walk:
         begin = self.pos
         self.pos += 9 + 16
         stated = _U32.unpack_from(content, 16)[0]
-        if stated and stated != self.fold():
+        if stated and stated != self.checksum(self.summary):
             raise self.damaged("checksum", "the summary")
         self.pos = begin + 9 + len(content)
         self.need(8, "its last 8 bytes")
-        if self.buffer[self.pos : self.pos + 8] != MAGIC:
+        if self.data[self.pos : self.pos + 8] != MAGIC:
             raise self.damaged("record", "its end")
         self.pos += 8
-        if self.offset != self.size:
-            raise self.damaged("record", "its end", f"{self.size - self.offset} bytes more")
+        if self.pos != self.size:
+            raise self.damaged("record", "its end", f"{self.size - self.pos} bytes more")
 
 
 def again(known: Schema | Channel, other: Schema | Channel) -> BadRecord:

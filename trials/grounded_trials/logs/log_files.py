@@ -21,7 +21,7 @@ from grounded.errors import GroundedError, alike, needs
 from grounded.findings import found
 from grounded_trials.formats import dataflash, parquet, text_tables
 from grounded_trials.formats.mcap_records import MAGIC, Messages, Metadata, Record, Schema
-from grounded_trials.formats.mcap_walk import read_records
+from grounded_trials.formats.mcap_walk import mapped, read_records
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
 from grounded_trials.plain_file import open_file, read_file
@@ -223,7 +223,7 @@ def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
 
 def _by_format(path: Path, head: bytes, stream: BinaryIO, layout: Layout) -> Iterator[Record]:
     if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
-        yield from _guarded("MCAP log", path, read_records(stream, str(path)))
+        yield from _guarded("MCAP log", path, read_records(mapped(stream), str(path)))
     elif (format := _format_of(path, head)) is not None:
         yield from _read_as(format, path, layout)
     else:
@@ -365,10 +365,9 @@ def kind_of(path: Path) -> str:
     try:
         with open_log(path) as stream:
             head = stream.read(len(MAGIC))
-        if head.startswith(_ZSTD):
-            return read_apart(path, _stated_packed)
-        with open_log(path) as stream:
-            return _stated(read_records(stream, str(path), packed=False)) if head == MAGIC else ""
+            if head == MAGIC:
+                return _stated(read_records(mapped(stream), str(path), packed=False))
+        return read_apart(path, _stated_packed) if head.startswith(_ZSTD) else ""
     except GroundedError:
         return ""
 

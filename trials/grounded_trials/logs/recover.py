@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import IO, Any
 
@@ -29,6 +28,7 @@ from grounded_trials.formats.mcap_records import (
     Record,
     Schema,
 )
+from grounded_trials.formats.mcap_walk import mapped
 from grounded_trials.formats.mcap_writer import McapWriter
 from grounded_trials.logs.log_files import empty, open_log
 from grounded_trials.logs.salvage import Salvage
@@ -96,7 +96,7 @@ def recover_log(source: str | Path, target: str | Path) -> Recovery:
 
 def _recover(source: Path, target: Path) -> Recovery:
     with open_log(source) as stream:
-        data = mmap(stream.fileno(), 0, access=ACCESS_READ)
+        data = mapped(stream)
     head, salvage = data[:HEAD], Salvage(data, str(source))
     try:
         with target.open("xb") as out:

@@ -11,7 +11,6 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator
 from functools import cached_property
-from mmap import mmap
 from struct import Struct
 
 import numpy as np
@@ -38,7 +37,7 @@ from grounded_trials.formats.mcap_records import (
     chunk_content,
     decompress,
 )
-from grounded_trials.formats.mcap_walk import again, chunk_records, message_positions
+from grounded_trials.formats.mcap_walk import Data, again, chunk_records, message_positions
 from grounded_trials.formats.messages import Ints
 
 _HEAD = Struct("<BQ")
@@ -59,7 +58,7 @@ class Salvage:
         unverified: number of saved messages without a valid checksum.
     """
 
-    def __init__(self, data: bytes | mmap, name: str) -> None:
+    def __init__(self, data: Data, name: str) -> None:
         self.data, self.name, self.size = data, name, len(data)
         self.losses: list[Finding] = []
         self.lost_messages: Counter[int] = Counter()
@@ -228,7 +227,7 @@ class Salvage:
         return np.flatnonzero(maybe)
 
     def _next_chain(self, start: int) -> int | None:
-        """Return the first offset from `start` on with a chain of records, None if there is none."""
+        """Return the first offset from `start` on with a chain of records, None for none."""
         after = self._places[np.searchsorted(self._places, start) :]
         return next((int(at) for at in after if self._is_chain(int(at))), None)
 
