@@ -13,7 +13,6 @@ from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.gathering import RUNAWAY
 from grounded_trials.report.page.page import page
-from grounded_trials.report.recording.recording import write_recording
 from grounded_trials.report.report_text import report_text
 from reported import car, gathered
 
@@ -40,6 +39,8 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.extra("view", "png")
 def test_a_report_is_made_of_any_numbers(car, tmp_path, case):
+    from grounded_trials.report.recording.recording import write_recording
+
     findings, runs = gathered(car), []
     for run in findings.runs:
         states = np.array(run.trial.states)

@@ -15,12 +15,13 @@ import pytest
 
 from facts import holding
 from grounded_trials.report.figures.paths import ended
-from grounded_trials.report.recording.layout import entity_of, over_time
-from grounded_trials.report.recording.recording import write_recording
 from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+from grounded_trials.report.recording.layout import entity_of, over_time
+from grounded_trials.report.recording.recording import write_recording
+
 RERUN = Path(sys.executable).with_name("rerun")
 needs_tool = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed")
 

@@ -13,7 +13,7 @@ result; its `to_json()` is the document that the command prints with --json.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
@@ -21,13 +21,12 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self, cast
 
 from grounded.checks import refused
-from grounded.errors import GroundedError, needs
 from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
     from grounded.frozen import Array
-    from grounded_trials.report.reporting import Report, report_in
+    from grounded_trials.report.reporting import report_in
     from grounded_trials.starting.drawing import draw as _draw
     from grounded_trials.workspace.adoption import adopt_effects
     from grounded_trials.workspace.adoption import undo_adoption as _undo_adoption
@@ -229,26 +228,6 @@ class Workspace(Folder):
         path = replace_target(here.config, columns, here.base_model, terminal or {}, only_at_end)
         self.forget()
         return path
-
-    def watch(
-        self, *, every: float = 1.0, trouble: Callable[[GroundedError], None] = lambda error: None
-    ) -> Iterator[Report]:
-        """Rewrite reports/report.html whenever its files change; an open page reloads itself.
-
-        Args:
-            every: polling interval [s].
-            trouble: called with each error that keeps the page from being written.
-
-        Yields:
-            A report each time the page has been written. The iterator never ends by itself.
-
-        Raises:
-            GroundedError: if the extra `report` is missing.
-        """
-        from grounded_trials.report.reporting import watched
-
-        needs("jinja2", "report")
-        return watched(self, every, trouble)
 
     def export(
         self,

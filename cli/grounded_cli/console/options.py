@@ -39,8 +39,8 @@ def command(
         def call(*args: Any, json_: bool = False, **options: Any) -> int:
             with stdout_kept():
                 telling = function(*args, **options)
-                done = next(telling, None)  # None: it has told all, as `report --watch`
-                if json_ and done is not None:
+                done = next(telling)
+                if json_:
                     show_json(done if isinstance(done, dict) else done.to_json())
                 else:
                     list(telling)

@@ -5,15 +5,13 @@ All files in reports/ are derived and may be deleted.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import GroundedError, needs
+from grounded.errors import needs
 from grounded.figures.figure import Figure, typeset
 from grounded.result import Result
 from grounded_trials.report.figures.png import png as drawn
@@ -21,14 +19,12 @@ from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
-from grounded_trials.report.recording.recording import write_recording
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
 
 RECORDING, PAGE, OPTIMUM = "recording.rrd", "report.html", "optimum.json"
-STAMP = "watched.svg"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,74 +121,18 @@ def report_in(
         if asked:
             needs(module, extra)
     findings, paths = gather(workspace), []
-    if html:
-        paths.append(save_page(workspace, findings))
+    files = {PAGE: page(findings).encode()} if html else {}
     if png:
-        paths += save_pictures(workspace, findings)
+        files |= {f"{figure.name}.png": drawn(figure) for figure in all_figures(findings)}
+    for name, data in files.items():
+        paths.append(made_folder(workspace.reports) / name)
+        write_atomically(paths[-1], data)
     if rrd:
-        paths.append(save_recording(workspace, findings))
+        from grounded_trials.report.recording.recording import write_recording  # needs rerun
+
+        paths.append(made_folder(workspace.reports) / RECORDING)
+        write_recording(findings, paths[-1])
     return Report(findings, tuple(paths))
-
-
-def save_recording(workspace: Folder, findings: Findings | None = None) -> Path:
-    """Write reports/recording.rrd for the Rerun viewer; return its path."""
-    path = made_folder(workspace.reports) / RECORDING
-    write_recording(findings or gather(workspace), path)
-    return path
-
-
-def save_page(workspace: Folder, findings: Findings, watched: int = 0) -> Path:
-    """Write reports/report.html; with `watched`, also the revision that makes it reload.
-
-    A page opened from a file may load pictures from its folder, but no data. So the revision is
-    stored as the width of an empty picture.
-    """
-    path = made_folder(workspace.reports) / PAGE
-    write_atomically(path, page(findings, watched).encode())
-    if watched:
-        stamp = f'<svg xmlns="http://www.w3.org/2000/svg" width="{watched}" height="1"/>'
-        write_atomically(path.with_name(STAMP), stamp.encode())
-    return path
-
-
-def watched(
-    workspace: Folder, every: float, trouble: Callable[[GroundedError], None]
-) -> Iterator[Report]:
-    """Write the page now and whenever one of its files changes, see `Workspace.watch`."""
-    before: object = None
-    revision = int(time.time()) % 30_000
-    while True:
-        now = _changed(workspace)
-        if now != before:
-            before, revision = now, revision % 30_000 + 1
-            try:
-                workspace.forget()
-                findings = gather(workspace)
-                yield Report(findings, (save_page(workspace, findings, revision),))
-            except GroundedError as error:
-                trouble(error)
-        time.sleep(every)
-
-
-def _changed(workspace: Folder) -> list[tuple[str, int, int]]:
-    """Return names, sizes and times of the files that the page depends on."""
-    found = []
-    for pattern in ("*.*", "candidates/*", "trials/**/*", f"{workspace.reports.name}/*.json"):
-        for path in workspace.folder.glob(pattern):
-            with suppress(OSError):  # deleted meanwhile
-                about = path.stat()
-                found.append((str(path), about.st_size, about.st_mtime_ns))
-    return sorted(found)
-
-
-def save_pictures(workspace: Folder, findings: Findings) -> list[Path]:
-    """Write the figures of the page as reports/utility.png, paths.png etc.; return their paths."""
-    paths = []
-    for figure in all_figures(findings):
-        path = made_folder(workspace.reports) / f"{figure.name}.png"
-        write_atomically(path, drawn(figure))
-        paths.append(path)
-    return paths
 
 
 def save_optimum(workspace: Folder, utility: float | None) -> None:

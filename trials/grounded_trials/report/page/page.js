@@ -350,21 +350,6 @@
   });
   night.addEventListener("change", () => { for (const plot of plots) if (plot.drawn) draw(plot); });
 
-  // Watching: the width of a small picture beside the page is the revision; reload if it changes.
-  const mine = +document.documentElement.dataset.watched;
-  if (mine) {
-    const kept = JSON.parse(sessionStorage.getItem("kept") || "{}");
-    if (kept.time) point(kept.time);
-    setInterval(() => {
-      const stamp = new Image();
-      stamp.onload = () => {
-        if (stamp.naturalWidth === mine) return;
-        sessionStorage.setItem("kept", JSON.stringify({ time }));
-        location.reload();
-      };
-      stamp.src = `watched.svg?${Date.now()}`;
-    }, 1000);
-  }
   for (const plot of plots) seen.observe(plot);
   // Draw the others later, one at a time, so that a page that is saved or scrolled is complete.
   const others = [...plots];

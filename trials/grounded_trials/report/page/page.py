@@ -29,12 +29,8 @@ from grounded_trials.wording import glued, placed, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE
 
 
-def page(findings: Findings, watched: int = 0) -> str:
+def page(findings: Findings) -> str:
     """Return the HTML of the report.
-
-    Args:
-        findings: the contents.
-        watched: the page's revision for `report --watch`; 0: the page does not reload.
 
     Raises:
         GroundedError: if Jinja2 is not installed.
@@ -70,7 +66,6 @@ def page(findings: Findings, watched: int = 0) -> str:
         number=number,
         height=_height,
         data=data,
-        watched=watched,
     )
 
 

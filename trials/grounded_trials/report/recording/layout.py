@@ -9,6 +9,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
 
 from grounded.figures.body import Body
 from grounded.figures.figure import Bars, Figure, Panel, typeset
@@ -46,8 +48,6 @@ class Space:
 
         A `tall` view is higher than wide: the camera is farther away, since it sees less aside.
         """
-        import rerun.blueprint as rrb
-
         (centre, extent), up = self._bounds, (0, 0, 1)
         distance = max(extent, 1e-3) * CAMERA_DISTANCE
         if is_mechanism(self.body):
@@ -96,8 +96,6 @@ def over_time(findings: Findings) -> list[Figure]:
 
 def escaped(name: str) -> str:
     """Return a name as a part of an entity's path."""
-    import rerun as rr
-
     return rr.new_entity_path([name]).removeprefix("/")
 
 
@@ -108,8 +106,6 @@ def entity_of(figure: Figure, panel: Panel | Bars) -> str:
 
 def blueprint(findings: Findings, space: Space) -> Any:
     """Return the views: overview, effects on and off, states, inputs, bias, one tab per trial."""
-    import rerun.blueprint as rrb
-
     figures = over_time(findings)
     plots = {figure.name: _plots(figure) for figure in figures}
     tabs = [
@@ -133,8 +129,6 @@ def blueprint(findings: Findings, space: Space) -> Any:
 
 
 def _overview(findings: Findings, space: Space, drawn: Mapping[str, Sequence[Any]]) -> Any:
-    import rerun.blueprint as rrb
-
     plots = [
         plot
         for name, most in (("states", FIRST), ("inputs", 2), ("bias", 2))
@@ -155,8 +149,6 @@ def _overview(findings: Findings, space: Space, drawn: Mapping[str, Sequence[Any
 
 def _answer(findings: Findings) -> Any:
     """Return the views of the verdict and, beside it, of the credit: both seen at once."""
-    import rerun.blueprint as rrb
-
     told = rrb.TextDocumentView(origin="/verdict", name="Diagnosis")
     if findings.diagnosis is None or not findings.diagnosis.credit:
         return told
@@ -171,8 +163,6 @@ def _rows(findings: Findings) -> list[float]:
 
 def _effects(findings: Findings, space: Space, plots: Sequence[Any]) -> list[Any]:
     """Return views of a run and the model's forecasts, without effects and with them."""
-    import rerun.blueprint as rrb
-
     better = findings.better
     if better is None or not (findings.runs or findings.logs):
         return []
@@ -187,8 +177,6 @@ def _effects(findings: Findings, space: Space, plots: Sequence[Any]) -> list[Any
 
 
 def _trials(findings: Findings, space: Space) -> list[Any]:
-    import rerun.blueprint as rrb
-
     shown = []
     for run in findings.runs[-TRIALS:]:
         names = dict(NAMES)
@@ -215,7 +203,5 @@ def _plots(figure: Figure) -> list[Any]:
 
 
 def _plot(origin: str, name: str) -> Any:
-    import rerun.blueprint as rrb
-
     key = rrb.PlotLegend(corner=rrb.Corner2D.LeftTop)
     return rrb.TimeSeriesView(origin=origin, name=typeset(name), plot_legend=key)

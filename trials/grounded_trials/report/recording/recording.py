@@ -25,8 +25,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import rerun as rr
 
-from grounded.errors import needs
 from grounded.figures.body import Body, Part
 from grounded.figures.figure import COLOURS as PAGE
 from grounded.figures.figure import Bars, Figure, rgb, typeset
@@ -100,7 +100,6 @@ def write_recording(findings: Findings, path: Path) -> None:
     Raises:
         GroundedError: if it can't be written, or rerun is not installed.
     """
-    rr = needs("rerun", "view")
     rr.set_strict_mode(True)
     identity = hashlib.sha256(f"{findings.name} {findings.task.hash}".encode()).hexdigest()[:32]
     stream = rr.RecordingStream("grounded", recording_id=identity)
@@ -129,8 +128,6 @@ class _Recorder:
         self.per_second = {n: per_second(u) for n, u in findings.task.model.states.items()}
 
     def everything(self) -> None:
-        import rerun as rr
-
         log, findings = self.stream.log, self.findings
         log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         log("summary", rr.TextDocument(summary(findings), media_type="text/markdown"), static=True)
@@ -229,8 +226,6 @@ class _Recorder:
 
     def cross(self, at: str, run: Run, arm: float, labelled: bool) -> None:
         """Record a cross where a run ended early, with a label to see or to hover over."""
-        import rerun as rr
-
         last = crash(run)
         place = None if last is None else self.body.path(run.trial.states[[last]])[0]
         if place is None or not np.isfinite(place).all():
@@ -243,8 +238,6 @@ class _Recorder:
 
     def marks(self, at: str, time: float, values: Array, colour: Colour, note: str) -> None:
         """Record values at one time as crosses with a note."""
-        import rerun as rr
-
         if not np.isfinite(values).all():
             return
         look = rr.SeriesPoints(
@@ -278,8 +271,6 @@ class _Recorder:
         self, at: str, trial: Trial, colour: str, path: str = "", width: float = 2.0
     ) -> None:
         """Record the path of a run, and the body that moves and turns along it."""
-        import rerun as rr
-
         self.path(at + path, trial.states, colour, width)
         rows = np.flatnonzero(np.isfinite(trial.states).all(axis=1))
         parts = self.body.parts
@@ -297,8 +288,6 @@ class _Recorder:
 
     def path(self, at: str, states: Array, colour: str, width: float) -> None:
         """Record a path in space as one static line."""
-        import rerun as rr
-
         points = self.body.path(states)
         points = points[np.isfinite(points).all(axis=1)]
         if not len(points):
@@ -311,8 +300,6 @@ class _Recorder:
         self, at: str, times: Array, values: Array, role: str, name: str = "", width: float = 1.0
     ) -> None:
         """Record the finite values of a curve over time, named by default after its role."""
-        import rerun as rr
-
         style = rr.SeriesLines(colors=COLOURS[role], names=name or role, widths=width)
         self.stream.log(at, style, static=True)
         keep = np.flatnonzero(np.isfinite(values))
@@ -321,8 +308,6 @@ class _Recorder:
 
     def columns(self, at: str, values: Array, dt: float, units: Mapping[str, str]) -> None:
         """Record the columns of an array as one entity; `units` by the names of the columns."""
-        import rerun as rr
-
         steps, width = values.shape
         names = [typeset(labelled(name, unit)) for name, unit in units.items()]
         colours = [SERIES[i % len(SERIES)] for i in range(width)]
@@ -342,8 +327,6 @@ def rate(residual: Array, dt: float) -> tuple[Array, float]:
 
 def drawn(part: Part, colour: Colour, ghost: bool = False) -> Any:
     """Return the archetype of a part in one colour; ghosts (predictions) as wireframes."""
-    import rerun as rr
-
     modes, size = rr.components.FillMode, part.size
     look = modes.MajorWireframe if ghost else modes.Solid
     if part.shape == "box":
