@@ -11,7 +11,7 @@ from typing import Any
 from grounded.errors import GroundedError, alike
 from grounded.findings import Weight, found
 
-MOST_NAMES = 40  # most names listed in a message
+MOST_NAMES = 12  # most names listed in a message
 
 
 def refused(code: str, *about: object, then: Any = None, **facts: Any) -> GroundedError:

@@ -7,8 +7,7 @@ import pytest
 
 from grounded.figures.body import motion
 from grounded.models import arm, cart_pole, lift, pendulum
-from grounded_trials.report.bodies import body_of, is_mechanism
-from grounded_trials.report.scene import scene_of
+from grounded_trials.report.bodies import body_of, is_mechanism, scene_of
 
 
 def _body(model):

@@ -11,13 +11,12 @@ import pytest
 from test_page import hostile
 
 from cli import grounded
-from grounded_trials import Workspace
 from grounded_trials.report.bodies import body_in
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page.page import page
 from grounded_trials.workspace.folder import Folder
 from page_browser import browser, missing
-from reported import car, cart, copied, gathered
+from reported import car, cart, gathered
 from workspaces import make
 
 __all__ = ["car", "cart"]
@@ -257,20 +256,4 @@ def test_hostile_names_run_nothing(cart, tmp_path, window):
     window.point("#states-0", 0.5, 0.5)
     window.run("document.querySelectorAll('.plot').forEach(e => e.focus())")
     assert window.run("return window.hacked") is None
-    assert window.errors() == []
-
-
-def test_a_watched_page_reloads_itself(cart, tmp_path, window):
-    folder = copied(cart, tmp_path / "w")
-    watching = Workspace(folder).watch(every=0.01)
-    first = next(watching)
-    window.open(first.paths[0])
-    before = window.run("return document.documentElement.dataset.watched")
-    (folder / "grounded.toml").touch()
-    next(watching)
-    for _ in range(50):
-        time.sleep(0.1)
-        if window.run("return document.documentElement.dataset.watched") != before:
-            break
-    assert window.run("return document.documentElement.dataset.watched") != before
     assert window.errors() == []

@@ -39,7 +39,7 @@ CASES = {
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.extra("view", "png")
 def test_a_report_is_made_of_any_numbers(car, tmp_path, case):
-    from grounded_trials.report.recording.recording import write_recording
+    from grounded_trials.report.recording import write_recording
 
     findings, runs = gathered(car), []
     for run in findings.runs:

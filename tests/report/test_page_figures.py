@@ -32,10 +32,10 @@ from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
 from grounded.search.planner import Planner
 from grounded.trial import Trial
+from grounded_trials.report.bodies import scene_of
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.forecast import forecast, forecast_error
-from grounded_trials.report.scene import scene_of
 from reported import car, cart, gathered
 
 __all__ = ["car", "cart"]

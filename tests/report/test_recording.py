@@ -19,8 +19,7 @@ from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-from grounded_trials.report.recording.layout import entity_of, over_time
-from grounded_trials.report.recording.recording import write_recording
+from grounded_trials.report.recording import entity_of, over_time, write_recording
 
 RERUN = Path(sys.executable).with_name("rerun")
 needs_tool = pytest.mark.skipif(not RERUN.exists(), reason="the rerun program is not installed")

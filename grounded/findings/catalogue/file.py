@@ -33,11 +33,7 @@ ENTRIES: dict[str, Entry] = {
         "[[ (at byte {byte})]]",
         "`recover` saves what can be saved",
     ),
-    "no_message": Entry(
-        "refuse",
-        "{about} holds no message[[: the file ends at byte {byte}]]",
-        "did the recorder stop at once, or is the copy unfinished? Copy or record it again",
-    ),
+    "no_message": Entry("refuse", "{about} holds no message[[: the file ends at byte {byte}]]"),
     "no_log": Entry(
         "refuse",
         "{about} is no log[[ but a {head}]][[: it begins with {begins}]]"
@@ -50,9 +46,7 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "{about} [[begins with '{line}', not with column names]][[!line? has no column of times]]"
         "[[ among {names}]]",
-        "[[line? add a line such as 't,x,v', or name the columns: `--columns t,x,v`, or `columns` "
-        "in "
-        "[log]; ]]"
+        "[[line? name the columns: `--columns t,x,v`, or `columns` in [log]; ]]"
         f"add or name {_STAMPS}[[; '{{rises}}' increases in every row]]; or give the rate of "
         "its rows [Hz], `--rate 100`, or `rate = 100` in [log]",
     ),
@@ -127,9 +121,8 @@ ENTRIES: dict[str, Entry] = {
         "gone}[[: {lost}]]",
         "{what:checksum=make it again,none=make it again,hash=restore it from a backup, or ingest "
         "the original log again,manifest=restore it,candidate=delete it; a new one is made,"
-        "policy=delete it; the trial holds the one that ran,name=rename it, or delete it if the "
-        "file of that candidate exists,gone=bring that back from a copy, or ingest the original "
-        "logs again}",
+        "policy=delete it; the trial holds the one that ran,name=rename it,gone=bring that back "
+        "from a copy, or ingest the original logs again}",
     ),
     "no_mapping": Entry(
         "refuse",
@@ -139,8 +132,7 @@ ENTRIES: dict[str, Entry] = {
     "untrusted": Entry(
         "refuse",
         "{about} {by:owner=belongs to another user,all=is writable by everybody,group=is writable "
-        "by its group}[[ ({id})]], so another user may have changed its code; nothing in {folder} "
-        "is executed",
+        "by its group}[[ ({id})]]; nothing in {folder} is executed",
         "if it is yours: chown -R $USER and chmod -R go-w, or name the folder in {trust}",
     ),
     # times of a log's signals
@@ -176,15 +168,13 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "'{about}' is {value:.4g} at {at:.3f} s, far outside all its other samples, {low:.4g} to "
         "{high:.4g}",
-        "delete that row or message from the log",
     ),
     "vanished": Entry(
         "warn",
         "[[{about} {about:has/have} no sample after {until:.2f} s of the log, in which other "
         "states go on until {whole:.2f} s: the trial ends there]][[{about} is not a finite number "
-        "at {ends}: the trial "
-        "ends there]][[all states are known from "
-        "{late:.3f} s on: the trial starts there]]",
+        "at {ends}: the trial ends there]][[all states are known from {late:.3f} s on: the trial "
+        "starts there]]",
     ),
     "odd_values": Entry(
         "warn",
@@ -201,8 +191,7 @@ ENTRIES: dict[str, Entry] = {
     "cut": Entry(
         "warn",
         "[[{about} ]][[!about? the file ]]is cut off at [[line {line}]][[byte {byte}]][[ "
-        "({text})]]: what came after "
-        "that is lost[[, only its index{index:1=}]]",
+        "({text})]]: what came after that is lost[[, only its index{index:1=}]]",
     ),
     "lost": Entry(
         "warn",

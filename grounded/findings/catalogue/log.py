@@ -263,7 +263,7 @@ ENTRIES: dict[str, Entry] = {
     "stored": Entry(
         "refuse",
         "{about} is stored already, as {trial}[[ ({used})]][[part?, a part of it]][[other?, read "
-        "in another way (another [log], [estimate] or [task] dt)]]",
+        "in another way (another [log], [estimate], [task] dt or --before)]]",
         "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted} all the "
         "same, discard {trial} and ingest it again]][[part? discard that and ingest this]]"
         "[[other? discard {trial} and ingest it again]]",

@@ -40,7 +40,6 @@ ENTRIES: dict[str, Entry] = {
         "[[sticks to its last value, up to {stuck:.3g} s at a time, and then jumps]][[misses "
         "samples, up to {gap:.3g} s at a time]][[comes in steps of {step}, as large as its "
         "changes]][[ ({share:%})]]",
-        "[[every? in a table, leave its cell empty in rows that repeat a value]]",
     ),
     "mismatch": Entry(
         "warn",

@@ -12,8 +12,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "joint": Entry(
         "note",
-        "[[{index} of ]]{about} is its joint[[ '{joint}']][[index? , in order from the base]]",
-        "[[index? check it by the joints of the controller]]",
+        "[[{index} of ]]{about} is its joint[[ '{joint}']][[index? , in order from the base: check "
+        "it]]",
     ),
     "follows": Entry(
         "note",
@@ -44,11 +44,9 @@ ENTRIES: dict[str, Entry] = {
     "interval": Entry(
         "note",
         "[[the log's commands change every {every:.3g} s; dt is {dt:.3g} s]][[, its rows come "
-        "every "
-        "{rows:.3g} s]][[read as seconds, its rows are {apart:.3g} s apart]]",
+        "every {rows:.3g} s]][[read as seconds, its rows are {apart:.3g} s apart]]",
         "[[every? [task] dt (--dt) sets another]][[apart? if the times are in ms or us, end that "
-        "column's name "
-        "with _ms or _us and create the workspace again in another folder]]",
+        "column's name with _ms or _us and create the workspace again in another folder]]",
     ),
     # what the file of a model says
     "unmoved": Entry(
@@ -58,8 +56,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "outside": Entry(
         "note",
-        "not all ranges of the joints include 0: {about} {about:starts/start} in the middle of "
-        "{about:its range/their ranges}",
+        "{about} {about:starts/start} in the middle of {about:its range/their ranges}, which "
+        "{about:does/do} not include 0",
         "set [task] start",
     ),
     "degrees": Entry(

@@ -1,8 +1,9 @@
 """Reports of a workspace: text, page, pictures, recording.
 
 Read `findings.py` first (all contents of a report, as values) and `gathering.py` (how they are
-read). `forecast.py` computes prediction errors, `scene.py` places a body in space and
-`report_text.py` is the report for a terminal;
-`figures/` makes the figures (values of `grounded.figures`), `page/` and `recording/` lay them out
-for a browser and for Rerun, `studies/` draws the paper's studies; `reporting.py` writes the files.
+read). `forecast.py` computes prediction errors, `bodies.py` places a robot in space, and
+`tables.py` has the sentences and tables of terminal, page and recording. `figures/` makes the
+figures (values of `grounded.figures`). `report_text.py`, `page/` and `recording.py` lay them out
+for a terminal, a browser and Rerun; `reporting.py` writes the files, `run_file.py` a trial as a
+table, and `study_pictures.py` draws the paper's studies.
 """

@@ -128,7 +128,7 @@ def report_in(
         paths.append(made_folder(workspace.reports) / name)
         write_atomically(paths[-1], data)
     if rrd:
-        from grounded_trials.report.recording.recording import write_recording  # needs rerun
+        from grounded_trials.report.recording import write_recording  # needs rerun
 
         paths.append(made_folder(workspace.reports) / RECORDING)
         write_recording(findings, paths[-1])

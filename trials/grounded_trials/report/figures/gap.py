@@ -16,9 +16,9 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import INSTANT_S, probe, samples
 from grounded.trial import Trial
+from grounded_trials.report.bodies import reading_order
 from grounded_trials.report.findings import ESTIMATED, Findings, Run
 from grounded_trials.report.forecast import forecast
-from grounded_trials.report.scene import reading_order
 from grounded_trials.wording import labelled, per_second, percent, shown
 
 SPAN_S = 30.0  # [s] of a long log that are drawn, where the errors are largest

@@ -14,9 +14,8 @@ from grounded.figures.body import Body, motion
 from grounded.figures.figure import WIDTHS, Curve, Dot, Figure, Panel, enlarging, legend
 from grounded.frozen import Array
 from grounded.result import listed
-from grounded_trials.report.bodies import body_in, is_mechanism
+from grounded_trials.report.bodies import Scene, body_in, is_mechanism, scene_of
 from grounded_trials.report.findings import Findings, Log, Run, compared
-from grounded_trials.report.scene import Scene, scene_of
 from grounded_trials.wording import labelled
 
 OTHERS = 60  # largest number of runs drawn behind the compared ones

@@ -23,7 +23,7 @@ from grounded.figures.figure import (
 from grounded.frozen import Array
 from grounded.result import listed
 from grounded.search.pictures import search_figure
-from grounded_trials.report.calmed import averaged, window_of
+from grounded_trials.report.bodies import reading_order, scene_of
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
@@ -33,7 +33,6 @@ from grounded_trials.report.findings import (
     prediction_error,
     selection,
 )
-from grounded_trials.report.scene import reading_order, scene_of
 from grounded_trials.wording import figure, labelled, per_second, shown, with_unit
 from grounded_trials.workspace.off_target import asked_for, tracked, tracking_error
 
@@ -41,6 +40,8 @@ FLAT = 0.2  # share of the limits' range below which inputs are drawn without th
 CUT = 5.0  # the axis is shortened only if all values span more than this times the calm ones
 DESIRED_END = "desired at the end"  # of a state that only `terminal` weighs
 ITERATIONS = 5  # largest number of iterations whose bias is drawn
+WINDOWS = 60  # means of a calmed curve
+ROUGH = 1.0  # ratio of the change from step to step to the values (rms) from which noise prevails
 
 
 def all_figures(findings: Findings) -> list[Figure]:
@@ -240,3 +241,31 @@ def _cut_off(values: list[Array], low: float, high: float) -> str:
     out = sorted({e for e in ends if not low <= e <= high})
     reached = " and ".join(figure(e, 2) for e in out).replace("-", "−")
     return f"up to {reached}" if out else ""
+
+
+def window_of(curves: Sequence[Array]) -> int:
+    """Return over how many steps to average curves that share a panel; 1 if they are calm.
+
+    A residual divided by dt multiplies a sensor's noise by 1/dt: at 50 Hz, 5 mm is 0.35 m/s. White
+    noise changes from step to step by sqrt(2) times its rms, the course of a system by less.
+
+    Args:
+        curves: values (T,) at equal intervals, in one unit; NaN where unknown.
+    """
+    known = [values[np.isfinite(values)] for values in curves]
+    long = max((len(values) for values in known), default=0)
+    if long < 2 * WINDOWS:
+        return 1
+    size = max(_rms(values) for values in known)
+    change = max(_rms(np.diff(values)) for values in known)
+    return -(-long // WINDOWS) if change > ROUGH * size else 1
+
+
+def averaged(values: Array, window: int) -> Array:
+    """Return means (T // window, ...) over consecutive steps."""
+    whole = values[: len(values) // window * window]
+    return np.asarray(whole.reshape(-1, window, *values.shape[1:]).mean(axis=1))
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
