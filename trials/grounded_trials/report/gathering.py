@@ -59,10 +59,24 @@ def gather(workspace: Folder) -> Findings:
     data = [t for t in fitting if not t.candidate]
     now, asked = _standing(workspace, contents)
     shown, logs = _shown(now, own), [_drawable(t) for t in data[-LOGS:]]
-    diagnosis = _diagnosis(workspace, lost)
-    better = _better(workspace, diagnosis, lost)
+
+    # the last diagnosis, and the model with what it found
+    diagnosis: Diagnosis | None = None
+    better: Better | None = None
+    try:
+        diagnosis = read_diagnosis(workspace.reports)
+    except GroundedError as error:
+        lost.append(Lost("diagnosis.json", str(error)))
+    try:
+        named = diagnosis is not None and not diagnosis.no_cause
+        better = better_model(workspace, diagnosis if named else None)
+    except GroundedError as error:
+        lost.append(Lost("the model as diagnosed", str(error)))
     usable = [t.id for t in fitting if t.known_steps >= LEAST_STEPS]
     since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
+    if asked is None:
+        mapped = not unmapped(workspace)
+        asked = next_command(workspace, now, diagnosis, usable) if mapped else INSPECT
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
@@ -76,7 +90,7 @@ def gather(workspace: Folder) -> Findings:
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=known_optimum(workspace.reports),
-        then=asked or _next(workspace, now, diagnosis, usable),
+        then=asked,
         better=better,
         since=since,
         settled=settled_in(workspace, diagnosis, since),
@@ -107,13 +121,6 @@ def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
     return [t for t in trials if t.id in latest or t.candidate in names]
 
 
-def _next(
-    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: list[str]
-) -> NextCommand:
-    """Return the next command, as `status` does."""
-    return INSPECT if unmapped(workspace) else next_command(workspace, now, diagnosis, usable)
-
-
 def _standing(workspace: Folder, contents: Contents) -> tuple[Standing, NextCommand | None]:
     """Return the standing, and the command by which the last trial should be discarded, or None.
 
@@ -123,25 +130,10 @@ def _standing(workspace: Folder, contents: Contents) -> tuple[Standing, NextComm
         if (asked := unanswered(workspace)[1]) is not None:
             now = standing_in(workspace, contents=contents)
             return undecided(now, asked.arguments[0]), asked
-    return _ahead(workspace, contents), None
-
-
-def _ahead(workspace: Folder, contents: Contents) -> Standing:
-    """Return the standing, one proposal ahead if that can be planned."""
-    try:
+    with suppress(GroundedError):
         ahead = not workspace.config.search.refit
-        return standing_in(workspace, ahead=ahead, contents=contents)
-    except GroundedError:
-        return standing_in(workspace, contents=contents)
-
-
-def _better(workspace: Folder, diagnosis: Diagnosis | None, lost: list[Lost]) -> Better | None:
-    named = diagnosis is not None and not diagnosis.no_cause
-    try:
-        return better_model(workspace, diagnosis if named else None)
-    except GroundedError as error:
-        lost.append(Lost("the model as diagnosed", str(error)))
-        return None
+        return standing_in(workspace, ahead=ahead, contents=contents), None
+    return standing_in(workspace, contents=contents), None
 
 
 def _runs(
@@ -171,9 +163,8 @@ def _drawable(trial: Trial) -> Trial:
     """Replace values beyond `RUNAWAY`, which can't be drawn, by NaN."""
     if max(np.abs(trial.states).max(initial=0.0), np.abs(trial.inputs).max(initial=0.0)) < RUNAWAY:
         return trial
-    states, inputs = (
-        np.where(np.abs(v) < RUNAWAY, v, np.nan) for v in (trial.states, trial.inputs)
-    )
+    states = np.where(np.abs(trial.states) < RUNAWAY, trial.states, np.nan)
+    inputs = np.where(np.abs(trial.inputs) < RUNAWAY, trial.inputs, np.nan)
     return replace(trial, states=states, inputs=inputs)
 
 
@@ -185,14 +176,6 @@ def _residual(planner: Planner, trial: Trial) -> Array:
         part = anchored(planner, trial.until(whole))
         residual[:whole] = residuals(planner.plan, part)[:, :n]
     return residual
-
-
-def _diagnosis(workspace: Folder, lost: list[Lost]) -> Diagnosis | None:
-    try:
-        return read_diagnosis(workspace.reports)
-    except GroundedError as error:
-        lost.append(Lost("diagnosis.json", str(error)))
-        return None
 
 
 def known_optimum(reports: Path) -> float | None:
