@@ -103,15 +103,10 @@ def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built
     np.testing.assert_allclose(after(true=heavier), ours, atol=5e-4)
 
 
-@pytest.mark.slow
-def test_without_mujoco_its_systems_are_left_out_with_a_word(tmp_path, monkeypatch):
+def test_without_mujoco_its_systems_are_refused(tmp_path, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "mujoco", None)
-    words = ["challenge", "make", tmp_path / "c", "--kind", "none", "--cases", "1", "--seed", "5"]
-    done = grounded(*words, "--systems", "kinked,mujoco")
-    assert done.code == 0 and "left out: " in done.err and "mujoco" in done.err
-    config = (tmp_path / "c" / "none-0000" / "grounded.toml").read_text()
-    assert "grounded.models.buggy" in config or "grounded.models.lift" in config
-    alone = grounded(*words[:2], tmp_path / "d", *words[3:], "--systems", "mujoco")
+    words = ["challenge", "make", tmp_path / "d", "--kind", "none", "--cases", "1", "--seed", "5"]
+    alone = grounded(*words, "--systems", "mujoco")
     assert alone.code == 1 and "mujoco" in alone.err
 
 

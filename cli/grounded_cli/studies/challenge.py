@@ -8,12 +8,12 @@ from typing import Any
 
 import click
 
-from grounded.challenge import make, simulator, summary
+from grounded.challenge import make, summary
 from grounded.engine import Engine
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded.refusals import refused
 from grounded_cli.console.options import command, flag, parallel
-from grounded_cli.console.terminal import bar, names_in, number, say, show, table
+from grounded_cli.console.terminal import bar, names_in, number, show, table
 from grounded_cli.console.workspace_option import typed
 from grounded_trials.challenge import diagnose_cases, score_cases, undiagnosed, write_cases
 from grounded_trials.wording import count
@@ -63,26 +63,12 @@ def make_cases(
 ) -> Iterator[dict[str, Any]]:
     """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
     sealed = Path(labels or f"{folder}-labels")
-    groups = _at_hand(names_in(systems))
-    drawn = make(kind, cases, seed, groups=groups, param_error=param_error)  # type: ignore[arg-type]
+    drawn = make(kind, cases, seed, groups=names_in(systems), param_error=param_error)  # type: ignore[arg-type]
     with bar("cases") as progress:
         names = write_cases(drawn, Path(folder), sealed, lambda done: progress(done, cases))
     yield {"workspace": folder, "labels": str(sealed), "cases": names}
     show(f"{folder}: {count(len(names), 'case')}; labels: {sealed}")
     show(f"\nnext: {typed(NextCommand('challenge', ('run', folder)))}")
-
-
-def _at_hand(groups: list[str]) -> list[str]:
-    """Drop the group `mujoco` if it is not installed and others are named; warn on stderr."""
-    try:
-        if "mujoco" in groups:
-            simulator()
-    except GroundedError as error:
-        if len(groups) == 1:
-            raise
-        say(f"left out: {error}")
-        return [group for group in groups if group != "mujoco"]
-    return groups
 
 
 @command("run", workspace=False, short_help="Diagnose the cases that have no diagnosis yet.")
@@ -104,7 +90,8 @@ def run_cases(
     if waiting:
         mean = sum(times.values()) / max(len(times), 1)
         show(f"{count(len(waiting), 'case')}: {mean:.1f} s CPU")
-    show(f"\n{_scored(folder)}")
+    labels = () if Path(f"{folder}-labels").is_dir() else ("--labels", "DIR")
+    show(f"\nnext: {typed(NextCommand('challenge', ('score', folder, *labels)))}")
 
 
 @command("score", workspace=False, short_help="Open the labels, score the diagnoses.")
@@ -149,14 +136,6 @@ def _labels(folder: str, labels: str | None) -> Path:
     if labels is None and Path(folder).is_dir() and not usual.is_dir():
         raise refused("file.missing", usual, where="--labels")
     return Path(labels) if labels is not None else usual
-
-
-def _scored(folder: str) -> str:
-    """Return the `next:` line for scoring, with --labels if they are not in the default folder."""
-    if Path(f"{folder}-labels").is_dir():
-        return f"next: {typed(NextCommand('challenge', ('score', folder)))}"
-    line = f"next: {typed(NextCommand('challenge', ('score', folder, '--labels', 'DIR')))}"
-    return f"{line}\nDIR is the folder with the labels, where `make` wrote them"
 
 
 def _words(value: Any) -> str:
