@@ -251,16 +251,16 @@ class _Recorder:
         early = [run for run in self.findings.runs if crash(run) is not None]
         reached = [self.body.path(run.trial.states[: run.trial.finite_steps + 1]) for run in early]
         size = float(np.ptp(np.vstack([points, *reached]), axis=0).max()) if early else 0.0
-        for run, path in zip(early, reached, strict=True):
-            name, note = run.trial.id, ended(run)
-            if np.isfinite(path[-1]).all():
-                lines = [[path[-1] - end, path[-1] + end] for end in ARM * size * np.array(CROSS)]
+        for run in early:
+            name, note, last = run.trial.id, ended(run), run.trial.finite_steps
+            place = self.body.path(run.trial.states[[last]])[0]
+            if np.isfinite(place).all():
+                lines = [[place - end, place + end] for end in ARM * size * np.array(CROSS)]
                 look: Any = {"colors": COLOURS["model"], "radii": rr.Radius.ui_points(2)}
                 look |= {"labels": [note, *[""] * (len(lines) - 1)]}
                 few = len(early) <= LABELS
                 for at, shown in ((f"paths/crashes/{name}", few), (f"trials/{name}/crash", True)):
                     self.log(at, rr.LineStrips3D(lines, show_labels=shown, **look))
-            last = run.trial.finite_steps
             at, values = f"trials/{name}/state/ended", run.trial.states[last]
             self.marks(at, last * self.dt, values, COLOURS["model"], note)
 
