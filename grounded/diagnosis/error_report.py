@@ -19,6 +19,8 @@ BOUNDS = ("alike", AT_MOST)  # sources of an upper bound
 CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
 # families of what arrives late, and the quantity that is a time [s]
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
+TINY = 1e-12  # an error that stands in for none
+STATES = 2  # whose errors are told
 BRIEF: dict[str, Any] = {"brief": True}  # marks a field whose key is omitted if it is empty
 
 
@@ -145,6 +147,42 @@ class RulerRow(Document):
     def tells(self, name: str, *columns: str) -> bool:
         """Check that the errors of a channel are meaningful: none of these columns runs away."""
         return not any(name in self.runs_away.get(column, ()) for column in columns)
+
+    @property
+    def changes(self) -> dict[str, float]:
+        """By how much the logarithm of each state's error grows; within the noise it does not.
+
+        States without an error are left out, as are those whose prediction diverged before.
+        """
+        found = {}
+        for name, before in self.crude.items():
+            now, floor = self.with_effects.get(name, math.nan), self.noise_floor.get(name, 0.0)
+            if before > 0 and math.isfinite(now) and self.tells(name, "crude"):
+                found[name] = math.log(max(now, floor, TINY) / max(before, floor, TINY))
+        return found
+
+    @property
+    def gains(self) -> dict[str, float]:
+        """The share of each state's error that is gone, negative if it grew."""
+        return {name: 1 - math.exp(change) for name, change in self.changes.items()}
+
+    @property
+    def above(self) -> dict[str, float]:
+        """Each state's error relative to its noise; infinite if that is not known."""
+        known = {n: e for n, e in self.with_effects.items() if math.isfinite(e)}
+        floors = {n: self.noise_floor.get(n, 0.0) for n in known if self.tells(n, "with_effects")}
+        return {n: known[n] / floor if floor > 0 else math.inf for n, floor in floors.items()}
+
+    @property
+    def most_off(self) -> str:
+        """The state with the largest error relative to its noise; "" if none was measured."""
+        off = self.above
+        return max(off, key=lambda name: (off[name], self.with_effects[name]), default="")
+
+    @property
+    def loses(self) -> bool:
+        """Whether its errors grow, over all states."""
+        return sum(self.changes.values()) > 0
 
 
 def gain(rows: Sequence[RulerRow], before: str, after: str) -> float:
@@ -300,27 +338,16 @@ class Correction(Document):
     curves: tuple[Curve, ...] = ()
 
 
-def doubt_of(unsure: float) -> float:
-    """Return the factor by which errors may exceed the noise floor and still be noise.
-
-    Args:
-        unsure: standard deviation of the floor's logarithm, `RulerRow.floor_unsure`.
-    """
-    return max(ABOVE, math.exp(MANY * unsure))
-
-
-STATES = 2  # whose errors are told
-TINY = 1e-12  # an error that stands in for none
-
-
 def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
     """Return the row to report: the longest horizon, or whole trials if the plant is slow.
 
     A heating process, for example, moves so little within 1 s that any model predicts it well.
     """
-    ahead, whole = furthest(rows), _whole(rows)
-    if ahead and whole and _most(ahead) < HALF < _most(whole):
-        return whole
+    ahead, drowned = furthest(rows), any(row.drowned for row in rows)
+    whole = next((row for row in rows if row.whole_trial and not drowned), None)
+    if ahead and whole:
+        least, most = (max(row.gains.values(), default=0.0) for row in (ahead, whole))
+        return whole if least < HALF < most else ahead
     return ahead
 
 
@@ -334,28 +361,10 @@ def states_told(row: RulerRow, tracked: Sequence[str] = ()) -> list[str]:
         row: the errors.
         tracked: the states that the task follows, the most important first.
     """
-    gains = {name: gain for name, gain in gains_of(row).items() if gain > SHOWS}
+    gains = {name: gain for name, gain in row.gains.items() if gain > SHOWS}
     order = {name: k for k, name in enumerate(tracked)}
     best = sorted(gains, key=lambda n: (order.get(n, len(tracked)), -gains[n]))[:STATES]
-    return best or [name for name in [most_off(row)] if name]
-
-
-def changes(row: RulerRow) -> dict[str, float]:
-    """Return by how much the logarithm of each state's error grows; within the noise it does not.
-
-    States without an error are left out, as are those whose prediction diverged before.
-    """
-    found = {}
-    for name, before in row.crude.items():
-        now, floor = row.with_effects.get(name, math.nan), row.noise_floor.get(name, 0.0)
-        if before > 0 and math.isfinite(now) and row.tells(name, "crude"):
-            found[name] = math.log(max(now, floor, TINY) / max(before, floor, TINY))
-    return found
-
-
-def gains_of(row: RulerRow) -> dict[str, float]:
-    """Return the share of each state's error that is gone, negative if it grew."""
-    return {name: 1 - math.exp(change) for name, change in changes(row).items()}
+    return best or [name for name in [row.most_off] if name]
 
 
 def lost_most(rows: Sequence[RulerRow]) -> tuple[RulerRow, str] | None:
@@ -364,18 +373,12 @@ def lost_most(rows: Sequence[RulerRow]) -> tuple[RulerRow, str] | None:
     Whole trials come first if they lose over all states, as they are what a plan is made for.
     """
     rows = [row for row in rows if not row.drowned]
-    for some in ([row for row in rows if row.whole_trial and _loses(row)], rows):
-        losses = [(change, row, name) for row in some for name, change in changes(row).items()]
+    for some in ([row for row in rows if row.whole_trial and row.loses], rows):
+        losses = [(change, row, name) for row in some for name, change in row.changes.items()]
         most, row, name = max(losses, key=lambda loss: loss[0], default=(0.0, None, ""))
         if row is not None and most > math.log(1 + SHOWS):
             return row, name
     return None
-
-
-def outweighed(rows: Sequence[RulerRow]) -> bool:
-    """Check whether the states that get worse lose more than the other states gain."""
-    lost = lost_most(rows)
-    return lost is not None and _loses(lost[0])
 
 
 def objection(
@@ -400,50 +403,41 @@ def objection(
     """
     if not effects:
         return None
-    if outweighed(rows):
+    lost, row = lost_most(rows), furthest(rows)
+    if lost is not None and lost[0].loses:
         return found("gap.next.doubt", *effects, why="worse")
     gap, wide = any(one.above for one in left), any(one.wide for one in left)
     tied = all(any(name in group for group in ties) for name in effects)
-    if gap and (wide or tied) and _gains_little(rows):
+    gains = [] if row is None else [*row.gains.values()]
+    if gap and (wide or tied) and gains and sum(gains) < SHOWS * len(gains):
         return found("gap.next.doubt", *effects, why="little")
     differ = {one.effect for one in agreement if not one.agrees} & {*effects}
-    if not differ or lost_most(rows) is None:
+    if not differ or lost is None:
         return None
     return found("gap.next.doubt", *(name for name in effects if name in differ), why="disagree")
 
 
 def excess(rows: Sequence[RulerRow]) -> tuple[float, str, RulerRow] | None:
-    """Return (error / noise, state, row) of the error furthest above the noise; None if none is."""
-    each = [(o, name, row) for row in rows if not row.drowned for name, o in above(row).items()]
-    clear = [one for one in each if doubt_of(one[2].floor_unsure) < one[0] < math.inf]
+    """Return (error / noise, state, row) of the error furthest above the noise; None if none is.
+
+    Errors may exceed a floor from few repeats by more, and still be noise.
+    """
+    each = [(o, name, row) for row in rows if not row.drowned for name, o in row.above.items()]
+    doubt = {id(row): max(ABOVE, math.exp(MANY * row.floor_unsure)) for row in rows}
+    clear = [one for one in each if doubt[id(one[2])] < one[0] < math.inf]
     return max(clear, key=lambda one: one[0], default=None)
-
-
-def above(row: RulerRow) -> dict[str, float]:
-    """Return each state's error relative to its noise; infinite if that is not known."""
-    known = {n: e for n, e in row.with_effects.items() if math.isfinite(e)}
-    floors = {n: row.noise_floor.get(n, 0.0) for n in known if row.tells(n, "with_effects")}
-    return {n: known[n] / floor if floor > 0 else math.inf for n, floor in floors.items()}
-
-
-def most_off(row: RulerRow) -> str:
-    """Return the state with the largest error relative to its noise; "" if none was measured."""
-    off = above(row)
-    return max(off, key=lambda name: (off[name], row.with_effects[name]), default="")
 
 
 def open_noise(rows: Sequence[RulerRow]) -> str:
     """Return the state whose error may be noise, for lack of repeats; "" if that is known."""
     row = furthest([row for row in rows if row.floor_at_most])
-    return "" if row is None or excess(rows) else most_off(row)
+    return "" if row is None or excess(rows) else row.most_off
 
 
 def noise_unknown(row: RulerRow, names: Sequence[str]) -> bool:
     """Check whether only an upper bound of the noise is known, and errors may be within it."""
-    if row.floor_from == AT_MOST:
-        return True
-    off = above(row)
-    return row.floor_at_most and any(off.get(name, 0.0) <= doubt_of(0.0) for name in names)
+    within = any(row.above.get(name, 0.0) <= ABOVE for name in names)
+    return row.floor_from == AT_MOST or (row.floor_at_most and within)
 
 
 def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Any]:
@@ -451,26 +445,3 @@ def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Any]:
     unit = row.unit_by_channel.get(name, "")
     values = {slot: getattr(row, column).get(name, math.nan) for slot, column in columns.items()}
     return {slot: Quantity(value, unit) for slot, value in values.items() if math.isfinite(value)}
-
-
-def _whole(rows: Sequence[RulerRow]) -> RulerRow | None:
-    """Return the row of whole trials; None if noise alone exceeds everything measured in less."""
-    if any(row.drowned for row in rows):
-        return None
-    return next((row for row in rows if row.whole_trial), None)
-
-
-def _most(row: RulerRow) -> float:
-    return max(gains_of(row).values(), default=0.0)
-
-
-def _loses(row: RulerRow) -> bool:
-    """Check whether the errors of a row grow, over all states."""
-    return sum(changes(row).values()) > 0
-
-
-def _gains_little(rows: Sequence[RulerRow]) -> bool:
-    """Check whether the mean share of the error that is gone a horizon ahead does not show."""
-    row = furthest(rows)
-    gains = [] if row is None else [*gains_of(row).values()]
-    return bool(gains) and sum(gains) < SHOWS * len(gains)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.diagnosis.error_report import RulerRow, changes
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.telling import columns_told, larger
 from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
 from grounded.result import figure, measured, measured_alike, percent, shown
@@ -110,7 +110,7 @@ def credit_figure(diagnosis: Diagnosis, states: int = STATES) -> Figure | None:
     """
     credit, ahead = diagnosis.credit, [e for e in diagnosis.prediction_error if not e.whole_trial]
     error = ahead[-1] if ahead and not ahead[-1].drowned else None
-    changed = changes(error) if error else {}
+    changed = error.changes if error else {}
     names = sorted(changed, key=lambda name: changed[name])[:states]
     panels = [worth_of(name, error, diagnosis) for name in names if error]
     if credit:
