@@ -135,21 +135,26 @@ def probe(
     noise = KnownNoise.of(task.model, diagnosis)
     latest = trials[-REPLAYED:]
     second = _adapted(task, latest, second, noise)
+    # either may be true: of each, the trials so far as it would have made them
     ways = []
-    for true, other in ((first, second), (second, first)):
-        again = (_run(task, true, policy, trial) for trial in latest)
-        ways.append(_Way(task, noise, true, other, [run for run in again if run is not None]))
-    told = ways[0].known * len(trials) / max(len(ways[0].trials), 1)
+    for both in ((first, second), (second, first)):
+        again = (_run(task, both[0], policy, trial) for trial in latest)
+        known = [run for run in again if run is not None]
+        ways.append((both, known, _apart(task, noise, both, known)))
+    told = ways[0][2] * len(trials) / max(len(ways[0][1]), 1)
     rows = [diagnosis.ranked(name) for name in group[:2]]
-    apart = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]
-    trust = min(1.0, max(NATS, float(np.ptp(apart))) / max(told, 1e-12))
+    nats = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]
+    trust = min(1.0, max(NATS, float(np.ptp(nats))) / max(told, 1e-12))
     best: tuple[float, Policy, str] | None = None
     for words, candidate in probes(policy, task.model, _inputs_of(task.model, group[:2])):
         runs = [_run(task, h, candidate) for h in (first, second)]
         kept = [run for run in runs if run is not None and safe(task, run)]
         if len(kept) < len(runs):
             continue
-        expected = min(way.adds(run) for way, run in zip(ways, kept, strict=True))
+        expected = min(
+            max(_apart(task, noise, both, [*known, run]) - so_far, 0.0)
+            for (both, known, so_far), run in zip(ways, kept, strict=True)
+        )
         if best is None or expected > best[0]:
             best = (expected, candidate, words)
     if best is None:
@@ -372,44 +377,22 @@ def safe(task: Task, run: Trial | None) -> bool:
     return bool(inside.all())
 
 
-class _Way:
-    """One of two rivals is true: what would a further run add to the evidence against the other?
+def _apart(
+    task: Task, noise: KnownNoise, both: Sequence[Hypothesis], runs: Sequence[Trial]
+) -> float:
+    """Return the evidence of runs for the first of two hypotheses, which made them [nats].
 
-    Args:
-        task: with the calibrated model.
-        noise: that of the diagnosis.
-        true: the hypothesis by which runs are simulated.
-        rival: the other one.
-        trials: runs with the commands of the trials so far, as `true` has them.
+    All values are fitted to all runs together. Fitted to a probe's run alone, the values of a rival
+    would forget what the trials so far say of them, and most rivals would pass for equivalent.
     """
-
-    def __init__(
-        self,
-        task: Task,
-        noise: KnownNoise,
-        true: Hypothesis,
-        rival: Hypothesis,
-        trials: Sequence[Trial],
-    ) -> None:
-        self.task, self.noise, self.both, self.trials = task, noise, (true, rival), list(trials)
-        self.known = self._apart(self.trials) if self.trials else 0.0
-
-    def adds(self, run: Trial) -> float:
-        """Return what a run adds [nats], with all values fitted to it and the trials together.
-
-        Fitted to the run alone, the values of a rival would forget what the trials so far say of
-        them, and most rivals would pass for equivalent.
-        """
-        return max(self._apart([*self.trials, run]) - self.known, 0.0)
-
-    def _apart(self, runs: Sequence[Trial]) -> float:
-        data, rss = self.noise.data(self.task, runs), []
-        predictor = Predictor(data)
-        for h in self.both:
-            start = [(h, self.noise.model, data.y.copy())]
-            fits = refine(predictor, start, iterations=ADAPTED, fixed_noise=True)
-            rss.append(float(fits[0].rss.sum()) if fits else np.inf)
-        return max(0.5 * (rss[1] - rss[0]), 0.0)
+    if not runs:
+        return 0.0
+    data, rss = noise.data(task, runs), []
+    for h in both:
+        start = [(h, noise.model, data.y.copy())]
+        fits = refine(Predictor(data), start, iterations=ADAPTED, fixed_noise=True)
+        rss.append(float(fits[0].rss.sum()) if fits else np.inf)
+    return max(0.5 * (rss[1] - rss[0]), 0.0)
 
 
 OWN = "the best candidate's policy"

@@ -146,40 +146,25 @@ class Found:
     delayed: Mapping[str, tuple[int, ...]]  # the inputs of each fitted delay
 
     @cached_property
-    def scales(self) -> Array:
-        """The unit of each unknown: of delays, then of the parameters' shifts, (C,)."""
+    def unknowns(self) -> dict[str, tuple[float, float, float]]:
+        """Each fitted delay [s] and parameter: value, standard deviation, half of its interval."""
         data, h = self.search.data, self.best.hypothesis
-        shifts = param_scale(data.model)[calibrated(data)] if h.spread else np.zeros(0)
-        return np.concatenate([np.ones(len(h.theta)), shifts])
-
-    @cached_property
-    def sure(self) -> tuple[Array, Array]:
-        """The standard deviation and half-width of the interval of each unknown, (C,) each."""
-        found = self.search.sure(self.best)
-        return self.scales * found[0], self.scales * found[1]
-
-    @cached_property
-    def at(self) -> dict[str, int]:
-        """Where each delay and each parameter that was fitted is among the unknowns."""
-        data, h = self.search.data, self.best.hypothesis
-        names = [data.model.param_names[i] for i in calibrated(data)] if h.spread else []
-        return {name: k for k, name in enumerate((*self.delayed, *names))}
-
-    @cached_property
-    def values(self) -> dict[str, float]:
-        """The value of every parameter of the model."""
-        model, shift = self.search.data.model, self.best.hypothesis.shift
-        values = model.values + (0.0 if shift is None else shift)
-        return dict(zip(model.param_names, values.tolist(), strict=True))
+        std, half = self.search.sure(self.best)
+        starts = [float(data.latency[inputs[0]]) for inputs in self.delayed.values()]
+        names, values, sizes = [*self.delayed], starts + h.theta, np.ones(len(starts))
+        if h.spread and h.shift is not None:
+            which = calibrated(data)
+            names += [data.model.param_names[i] for i in which]
+            values = np.concatenate([values, (data.model.values + h.shift)[which]])
+            sizes = np.concatenate([sizes, param_scale(data.model)[which]])
+        rows = np.column_stack([values, sizes * std, sizes * half]).tolist()
+        return {name: (v, s, w) for name, (v, s, w) in zip(names, rows, strict=True)}
 
     @cached_property
     def told(self) -> dict[str, Identifiable]:
         """How well the trials identify each parameter that was asked for."""
-        known = {
-            name: Estimate(self.values[name], float(self.sure[0][k]))
-            for name, k in self.at.items()
-            if name in self.values
-        }
+        params = self.search.data.model.params
+        known = {n: Estimate(v, s) for n, (v, s, _) in self.unknowns.items() if n in params}
         return {one.parameter: one for one in identified(self.free, self.best, known).parameters}
 
 
@@ -209,24 +194,23 @@ def report(
         shares: which parts of the trials were used, if not all.
     """
     search, best, data = found.search, found.best, found.search.data
-    params = dict[str, FittedValue]()
-    sure = list(zip(*found.sure, strict=True))
+    params, fitted = dict[str, FittedValue](), found.unknowns
     for name in asked:
-        param, start = model.params[name], model.params[name].value
-        (low, high), k = param.reach, found.at.get(name)
-        if k is None:
-            params[name] = FittedValue(start, np.inf, low, high, param.unit, False, start)
+        param = model.params[name]
+        (low, high), start, unit = param.reach, param.value, param.unit
+        if name not in fitted:
+            params[name] = FittedValue(start, np.inf, low, high, unit, False, start)
             continue
-        value, (e, w) = found.values[name], map(float, sure[k])
-        low, high, given = max(low, value - w), min(high, value + w), (*found.told[name].given,)
-        params[name] = FittedValue(value, e, low, high, param.unit, True, start, given)
+        (value, e, w), given = fitted[name], (*found.told[name].given,)
+        low, high = max(low, value - w), min(high, value + w)
+        params[name] = FittedValue(value, e, low, high, unit, True, start, given)
     latency = data.latency.copy()
-    for k, (name, inputs) in enumerate(found.delayed.items()):
-        q, start = best.hypothesis.effects[k].free[0], float(data.latency[inputs[0]])
-        value, (e, w) = start + float(best.hypothesis.theta[k]), map(float, sure[k])
-        ends = max(value - w, 0.0), value + w
+    for effect, (name, inputs) in zip(best.hypothesis.effects, found.delayed.items(), strict=True):
+        q, start, (value, e, w) = effect.free[0], float(data.latency[inputs[0]]), fitted[name]
         known = e <= UNKNOWN * (q.high - q.low) / np.sqrt(12)
-        e, ends = (e, ends) if known else (np.inf, (0.0, start + q.high))
+        e, ends = (
+            (e, (max(value - w, 0.0), value + w)) if known else (np.inf, (0.0, start + q.high))
+        )
         params[name] = FittedValue(value, e, *ends, "s", known, start)
         latency[list(inputs)] = value
     # held-out errors by the ruler of the diagnosis
@@ -239,7 +223,7 @@ def report(
     status = "converged" if best.settled else "still rising"
     made = Fit(
         params=params,
-        model=model.with_values(found.values),
+        model=model.with_values({n: fitted[n][0] for n in model.params if n in fitted}),
         latency=latency,
         loglik=best.loglik,
         status=status,

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -31,6 +32,7 @@ from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import param_scale
 from grounded.diagnosis.parts import Agreement, Changed, Estimate, TrialValue
+from grounded.diagnosis.validation.choose import jackknife
 from grounded.frozen import Array
 
 RIVALS = 8  # hypotheses of one, and of two effects, that are also tested for changes
@@ -162,19 +164,12 @@ def _units(trial_of: Array, group: Array) -> Array:
     return np.asarray(np.arange(len(trial_of)) if any(alone) else trial_of, float)
 
 
-@dataclass(frozen=True)
-class _Difference:
+class _Difference(NamedTuple):
     """The difference of one column between the groups, given those that differ already."""
 
     shifts: Array  # (2,) from the common value
     stds: Array  # (2,)
-
-    @property
-    def evidence(self) -> float:
-        """Half of a chi-squared with one degree of freedom [nats]."""
-        square = float((self.stds**2).sum())
-        apart = float(self.shifts[0] - self.shifts[1]) ** 2
-        return 0.5 * apart / square if 0 < square < np.inf else 0.0
+    evidence: float  # half of a chi-squared with one degree of freedom [nats]
 
 
 def _difference(
@@ -184,21 +179,18 @@ def _difference(
     columns = [*taken, k]
     shifts, stds = np.zeros(2), np.full(2, np.inf)
     for g in (0, 1):
-        own = group == g
-        G = fit.gram[own][:, columns][:, :, columns]
-        s = fit.score[own][:, columns]
+        names, own = np.unique(units[group == g], return_inverse=True)
+        G, s = (np.zeros((len(names), *[len(columns)] * d)) for d in (2, 1))
+        np.add.at(G, own, fit.gram[group == g][:, columns][:, :, columns])
+        np.add.at(s, own, fit.score[group == g][:, columns])
         total, score = G.sum(axis=0), s.sum(axis=0)
         if not total[-1, -1] > 0:
             continue
         inverse = np.linalg.pinv(total, hermitian=True)
         shifts[g] = -float((inverse @ score)[-1])
-        without = []
-        for unit in np.unique(units[own]):
-            kept = units[own] != unit
-            if kept.any():
-                less = np.linalg.pinv(G[kept].sum(axis=0), hermitian=True)
-                without.append(-float((less @ s[kept].sum(axis=0))[-1]))
-        count = len(without)
-        jackknife = (count - 1) * float(np.var(without)) if count > 1 else 0.0
-        stds[g] = np.sqrt(max(float(inverse[-1, -1]), jackknife))
-    return _Difference(shifts, stds)
+        less = np.linalg.pinv(total - G, hermitian=True)  # without each unit
+        without = -(less @ (score - s)[..., None])[:, -1]
+        scatter = float(jackknife(without)[0]) if len(names) > 1 else 0.0
+        stds[g] = max(float(np.sqrt(inverse[-1, -1])), scatter)
+    square, apart = float((stds**2).sum()), float(shifts[0] - shifts[1]) ** 2
+    return _Difference(shifts, stds, 0.5 * apart / square if 0 < square < np.inf else 0.0)
