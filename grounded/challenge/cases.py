@@ -86,9 +86,7 @@ def make(
         name = only or str(rng.choice(list(share), p=list(share.values())))
         case = None
         while case is None:
-            case = _case(
-                f"{kind}-{i:04d}", kind, i, systems.SYSTEMS[name](), rng, param_error, noise
-            )
+            case = _case(f"{kind}-{i:04d}", kind, i, systems.SYSTEMS[name], rng, param_error, noise)
         yield case
 
 
@@ -230,7 +228,7 @@ def _run(
         error = np.clip(model.difference(y, target[t]), -2.0, 2.0)
         return np.asarray(np.clip(u[t] + gains[t] @ error, system.low, system.high))
 
-    held = u[0] if system.settled else system.held
+    held = u[0] if system.settled else np.zeros(model.m)
     wobble = np.array([truth.disturbance.measurement.get(n, 0.0) for n in model.state_names])
     first = start + wobble * rng.standard_normal(model.n)
     return truth.run(rng, control, first, held, setting.steps, setting.dt)

@@ -177,7 +177,7 @@ def of_crude(label: Mapping[str, Any], model: Model) -> dict[str, Any]:
 
     A drawn shift is relative to the system's own value, which the crude model may not have.
     """
-    true = systems.SYSTEMS[label["system"]]().model if label["param_error"] else model
+    true = systems.SYSTEMS[label["system"]].model if label["param_error"] else model
     effects = []
     for entry in label["effects"]:
         name = entry["effect"].removeprefix("parameter:")

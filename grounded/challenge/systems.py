@@ -7,7 +7,7 @@ on real robots.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -45,7 +45,6 @@ class SystemUnderTest:
     tracking: dict[str, float]  # weights of the regulator
     effort: Array  # (m,) weights of inputs
     manoeuvre: Callable[[np.random.Generator, Any, Model], tuple[Array, Array]]
-    held: Array
     rates: tuple[float, ...] = (20.0, 30.0, 50.0)  # [Hz]
     latency: tuple[float, ...] = ()
     driven: str = "v"
@@ -111,65 +110,56 @@ def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array
     return u, start
 
 
-def car() -> SystemUnderTest:
-    """Return the RC car of section 5.2 (20 to 50 Hz, overhead camera)."""
-    process = {"delta": 0.01, "v": 0.03, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
-    measured = {"delta": 0.01, "v": 0.02, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
-    return SystemUnderTest(
-        name="car",
-        model=car_model,
-        low=np.array([-1.0, 0.0]),
-        high=np.array([1.0, 1.0]),
-        process=process,
-        measurement=measured,
-        tracking={"delta": 0.2, "v": 1.0, "x": 4.0, "y": 4.0, "psi": 1.0},
-        effort=np.array([2.0, 2.0]),
-        manoeuvre=_drive,
-        held=np.zeros(2),
-        latency=(0.1, 0.1),
-    )
+# The RC car of section 5.2 (20 to 50 Hz, overhead camera)
+_CAR_NOISE = {"delta": 0.01, "v": 0.02, "x": 0.004, "y": 0.004, "psi": 0.01, "psi_rate": 0.1}
+CAR = SystemUnderTest(
+    name="car",
+    model=car_model,
+    low=np.array([-1.0, 0.0]),
+    high=np.array([1.0, 1.0]),
+    process=_CAR_NOISE | {"v": 0.03},
+    measurement=_CAR_NOISE,
+    tracking={"delta": 0.2, "v": 1.0, "x": 4.0, "y": 4.0, "psi": 1.0},
+    effort=np.array([2.0, 2.0]),
+    manoeuvre=_drive,
+    latency=(0.1, 0.1),
+)
 
 
-def pendulum() -> SystemUnderTest:
-    """Return a torque-driven pendulum with an encoder."""
-    return SystemUnderTest(
-        name="pendulum",
-        model=pendulum_model,
-        low=np.array([-5.0]),
-        high=np.array([5.0]),
-        process={"theta": 0.004, "omega": 0.06},
-        measurement={"theta": 0.005, "omega": 0.05},
-        tracking={"theta": 4.0, "omega": 0.4},
-        effort=np.array([0.2]),
-        manoeuvre=_swing,
-        held=np.zeros(1),
-        driven="omega",
-    )
+# A torque-driven pendulum with an encoder
+PENDULUM = SystemUnderTest(
+    name="pendulum",
+    model=pendulum_model,
+    low=np.array([-5.0]),
+    high=np.array([5.0]),
+    process={"theta": 0.004, "omega": 0.06},
+    measurement={"theta": 0.005, "omega": 0.05},
+    tracking={"theta": 4.0, "omega": 0.4},
+    effort=np.array([0.2]),
+    manoeuvre=_swing,
+    driven="omega",
+)
 
 
-def aircraft() -> SystemUnderTest:
-    """Return the small aircraft of section 5.1 (50 Hz)."""
-    process = {"u": 0.05, "v": 0.05, "w": 0.05, "p": 0.05, "q": 0.05, "r": 0.03}
-    process |= {"north": 0.02, "east": 0.02, "altitude": 0.02, "phi": 0.003, "theta": 0.003}
-    process |= {"psi": 0.003}
-    measured = {"north": 0.05, "east": 0.05, "altitude": 0.05, "u": 0.05, "v": 0.05, "w": 0.05}
-    measured |= {"phi": 0.005, "theta": 0.005, "psi": 0.008, "p": 0.02, "q": 0.02, "r": 0.02}
-    return SystemUnderTest(
-        name="aircraft",
-        model=aircraft_model,
-        low=np.array([0.0, -0.4, -0.4, -0.4]),
-        high=np.array([1.0, 0.4, 0.4, 0.4]),
-        process=process,
-        measurement=measured,
-        tracking={"altitude": 0.05, "u": 0.05, "phi": 1.0, "theta": 1.0, "psi": 0.5, "p": 0.05},
-        effort=np.array([4.0, 20.0, 20.0, 20.0]),
-        manoeuvre=_fly,
-        held=np.zeros(4),
-        rates=(50.0,),
-        driven="q",
-        duration=(5.0, 7.0),
-        settled=True,
-    )
+# The small aircraft of section 5.1 (50 Hz)
+AIRCRAFT = SystemUnderTest(
+    name="aircraft",
+    model=aircraft_model,
+    low=np.array([0.0, -0.4, -0.4, -0.4]),
+    high=np.array([1.0, 0.4, 0.4, 0.4]),
+    process=dict.fromkeys("uvwpq", 0.05)
+    | {"r": 0.03, "north": 0.02, "east": 0.02, "altitude": 0.02}
+    | dict.fromkeys(("phi", "theta", "psi"), 0.003),
+    measurement=dict.fromkeys(("north", "east", "altitude", "u", "v", "w"), 0.05)
+    | {"phi": 0.005, "theta": 0.005, "psi": 0.008, "p": 0.02, "q": 0.02, "r": 0.02},
+    tracking={"altitude": 0.05, "u": 0.05, "phi": 1.0, "theta": 1.0, "psi": 0.5, "p": 0.05},
+    effort=np.array([4.0, 20.0, 20.0, 20.0]),
+    manoeuvre=_fly,
+    rates=(50.0,),
+    driven="q",
+    duration=(5.0, 7.0),
+    settled=True,
+)
 
 
 def _crawl(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
@@ -178,22 +168,20 @@ def _crawl(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
     return u, start
 
 
-def buggy() -> SystemUnderTest:
-    """Return a car with a kink between driving and braking and noise that grows with speed."""
-    return SystemUnderTest(
-        name="buggy",
-        model=buggy_model,
-        low=np.array([-1.0, -0.3]),
-        high=np.array([1.0, 1.0]),
-        process={"x": 0.01, "y": 0.01, "psi": 0.04, "v": 0.15},
-        measurement={"x": 0.004, "y": 0.004, "psi": 0.01, "v": 0.02},
-        tracking={"x": 4.0, "y": 4.0, "psi": 1.0, "v": 1.0},
-        effort=np.array([2.0, 2.0]),
-        manoeuvre=_crawl,
-        held=np.zeros(2),
-        rates=(20.0, 50.0, 100.0),
-        grows=("v", 1.5),
-    )
+# A car with a kink between driving and braking and noise that grows with speed
+BUGGY = SystemUnderTest(
+    name="buggy",
+    model=buggy_model,
+    low=np.array([-1.0, -0.3]),
+    high=np.array([1.0, 1.0]),
+    process={"x": 0.01, "y": 0.01, "psi": 0.04, "v": 0.15},
+    measurement={"x": 0.004, "y": 0.004, "psi": 0.01, "v": 0.02},
+    tracking={"x": 4.0, "y": 4.0, "psi": 1.0, "v": 1.0},
+    effort=np.array([2.0, 2.0]),
+    manoeuvre=_crawl,
+    rates=(20.0, 50.0, 100.0),
+    grows=("v", 1.5),
+)
 
 
 def _hoist(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
@@ -203,23 +191,21 @@ def _hoist(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
     return np.clip(volts, -6, 6)[:, None], np.zeros(2)
 
 
-def lift() -> SystemUnderTest:
-    """Return an axis with kinks in drive and friction and noise that grows with speed."""
-    return SystemUnderTest(
-        name="lift",
-        model=lift_model,
-        low=np.array([-6.0]),
-        high=np.array([6.0]),
-        process={"z": 0.001, "w": 0.12},
-        measurement={"z": 0.002, "w": 0.02},
-        tracking={"z": 10.0, "w": 0.5},
-        effort=np.array([0.05]),
-        manoeuvre=_hoist,
-        held=np.zeros(1),
-        rates=(20.0, 50.0, 100.0),
-        driven="w",
-        grows=("w", 0.7),
-    )
+# An axis with kinks in drive and friction and noise that grows with speed
+LIFT = SystemUnderTest(
+    name="lift",
+    model=lift_model,
+    low=np.array([-6.0]),
+    high=np.array([6.0]),
+    process={"z": 0.001, "w": 0.12},
+    measurement={"z": 0.002, "w": 0.02},
+    tracking={"z": 10.0, "w": 0.5},
+    effort=np.array([0.05]),
+    manoeuvre=_hoist,
+    rates=(20.0, 50.0, 100.0),
+    driven="w",
+    grows=("w", 0.7),
+)
 
 
 def _reach(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
@@ -251,26 +237,24 @@ def _accelerations(model: Model, x: Array) -> tuple[Array, Array]:
     return found[0], np.column_stack([found[1] - found[0], found[2] - found[0]])
 
 
-def arm() -> SystemUnderTest:
-    """Return a two-link arm with encoders, whose real system is simulated by MuJoCo."""
-    return SystemUnderTest(
-        name="arm",
-        model=arm_model,
-        low=np.array([-15.0, -15.0]),
-        high=np.array([15.0, 15.0]),
-        process={"q1_vel": 0.03, "q2_vel": 0.05},
-        measurement={"q1": 0.001, "q2": 0.001, "q1_vel": 0.01, "q2_vel": 0.01},
-        tracking={"q1": 20.0, "q2": 20.0, "q1_vel": 0.3, "q2_vel": 0.3},
-        effort=np.array([0.05, 0.05]),
-        manoeuvre=_reach,
-        held=np.zeros(2),
-        rates=(50.0, 100.0),
-        driven="q1_vel",
-        duration=(4.0, 7.0),
-        settled=True,
-        bend=0.005,
-        built=mechanism.arm_built,
-    )
+# A two-link arm with encoders, whose real system is simulated by MuJoCo
+ARM = SystemUnderTest(
+    name="arm",
+    model=arm_model,
+    low=np.array([-15.0, -15.0]),
+    high=np.array([15.0, 15.0]),
+    process={"q1_vel": 0.03, "q2_vel": 0.05},
+    measurement={"q1": 0.001, "q2": 0.001, "q1_vel": 0.01, "q2_vel": 0.01},
+    tracking={"q1": 20.0, "q2": 20.0, "q1_vel": 0.3, "q2_vel": 0.3},
+    effort=np.array([0.05, 0.05]),
+    manoeuvre=_reach,
+    rates=(50.0, 100.0),
+    driven="q1_vel",
+    duration=(4.0, 7.0),
+    settled=True,
+    bend=0.005,
+    built=mechanism.arm_built,
+)
 
 
 def _shove(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
@@ -281,25 +265,23 @@ def _shove(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
     return np.clip(force, -10, 10)[:, None], start
 
 
-def cart_pole() -> SystemUnderTest:
-    """Return a cart with a hanging pole, whose real system is simulated by MuJoCo."""
-    return SystemUnderTest(
-        name="cart_pole",
-        model=cart_pole_model,
-        low=np.array([-10.0]),
-        high=np.array([10.0]),
-        process={"x_vel": 0.02, "theta_vel": 0.03},
-        measurement={"x": 0.002, "theta": 0.003, "x_vel": 0.02, "theta_vel": 0.03},
-        tracking={"x": 5.0, "theta": 2.0, "x_vel": 0.5, "theta_vel": 0.2},
-        effort=np.array([0.1]),
-        manoeuvre=_shove,
-        held=np.zeros(1),
-        rates=(20.0, 50.0, 100.0),
-        driven="x_vel",
-        duration=(4.0, 8.0),
-        bend=0.02,
-        built=mechanism.cart_built,
-    )
+# A cart with a hanging pole, whose real system is simulated by MuJoCo
+CART_POLE = SystemUnderTest(
+    name="cart_pole",
+    model=cart_pole_model,
+    low=np.array([-10.0]),
+    high=np.array([10.0]),
+    process={"x_vel": 0.02, "theta_vel": 0.03},
+    measurement={"x": 0.002, "theta": 0.003, "x_vel": 0.02, "theta_vel": 0.03},
+    tracking={"x": 5.0, "theta": 2.0, "x_vel": 0.5, "theta_vel": 0.2},
+    effort=np.array([0.1]),
+    manoeuvre=_shove,
+    rates=(20.0, 50.0, 100.0),
+    driven="x_vel",
+    duration=(4.0, 8.0),
+    bend=0.02,
+    built=mechanism.cart_built,
+)
 
 
 def regulator(
@@ -311,7 +293,7 @@ def regulator(
     x[0] = start
     lag = [round(late / dt) for late in system.latency] or [0] * model.m
     arrived = np.column_stack(
-        [np.concatenate([np.full(d, system.held[j]), u[: T - d, j]]) for j, d in enumerate(lag)]
+        [np.concatenate([np.zeros(d), u[: T - d, j]]) for j, d in enumerate(lag)]
     )
     for t in range(T):
         x[t + 1] = model.system.step(x[t][None], arrived[t][None], model.values, dt)[0]
@@ -326,8 +308,8 @@ def regulator(
     return x, 0.7 * K
 
 
-SYSTEMS: dict[str, Callable[[], SystemUnderTest]] = {
-    made.__name__: made for made in (car, pendulum, aircraft, buggy, lift, arm, cart_pole)
+SYSTEMS: Mapping[str, SystemUnderTest] = {
+    one.name: one for one in (CAR, PENDULUM, AIRCRAFT, BUGGY, LIFT, ARM, CART_POLE)
 }
 GROUPS: dict[str, dict[str, float]] = {  # systems, and the probability of each
     "own": {"car": 0.6, "pendulum": 0.2, "aircraft": 0.2},

@@ -27,7 +27,7 @@ def test_kinked_systems_run_closed_loop_at_a_rate_of_theirs(system):
 
 @pytest.mark.parametrize("system", ["car", "lift", "aircraft"])
 def test_every_effect_is_drawn_in_a_size_that_its_bounds_allow(system):
-    model, rng = SYSTEMS[system]().model, np.random.default_rng(0)
+    model, rng = SYSTEMS[system].model, np.random.default_rng(0)
     names = (*model.state_names, *model.input_names)
     scales = Scales(dict.fromkeys(names, -1.0), dict.fromkeys(names, 1.0), dt=0.05, duration=8.0)
     visited = rng.normal(size=(9, model.n))
@@ -41,7 +41,7 @@ def test_every_effect_is_drawn_in_a_size_that_its_bounds_allow(system):
 
 @pytest.mark.parametrize("mechanism", [False, True])
 def test_what_no_family_describes_changes_inputs_or_rates(mechanism):
-    model, drawn = SYSTEMS["car"]().model, {}
+    model, drawn = SYSTEMS["car"].model, {}
     for seed in range(40):
         rng = np.random.default_rng(seed)
         one = draw_withheld(rng, model, np.ones(model.m), "v", 1.0, 8.0, mechanism)
@@ -62,7 +62,7 @@ def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():
     from grounded.challenge.truth import Truth
     from grounded.effects import Library, scales_of
 
-    model = SYSTEMS["car"]().model
+    model = SYSTEMS["car"].model
     still = np.zeros((4, model.n))
     drift = Library().effect(
         "offset:psi", model, scales_of(model, still, np.zeros((4, model.m)), 0.02, 0.06)
@@ -77,7 +77,7 @@ def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():
 )
 def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built, motor):
     pytest.importorskip("mujoco")
-    model, rng = SYSTEMS[system]().model, np.random.default_rng(1)
+    model, rng = SYSTEMS[system].model, np.random.default_rng(1)
     x, u = rng.normal(size=model.n), 2 * rng.normal(size=model.m)
 
     def after(**part):
@@ -163,7 +163,7 @@ def test_a_shift_of_a_parameter_is_counted_from_the_crude_value():
     effects = [{"effect": "parameter:L", "params": {"d": 0.1}}]
     effects.append({"effect": "delay:steering", "params": {"d": 0.1}})
     label = {"effects": effects, "param_error": 0.05, "system": "car"}
-    true = SYSTEMS["car"]().model
+    true = SYSTEMS["car"].model
     crude = true.with_values({"L": true.params["L"].value * 1.04})
     parameter, delay = of_crude(label, crude)["effects"]
     assert parameter["params"]["d"] == pytest.approx(0.1 - 0.04 * true.params["L"].value)
