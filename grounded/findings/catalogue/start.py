@@ -21,7 +21,11 @@ ENTRIES: dict[str, Entry] = {
         "{of}[[opposite?  with the OPPOSITE SIGN]][[, correlation {correlation:.3f}]]"
         "[[, {slope:.3g} times as large]]",
     ),
-    "still": Entry("note", "{about} never {about:changes/change} in this log"),
+    "still": Entry(
+        "note",
+        "{about} never {about:changes/change} in this log",
+        "[[empty? there are no messages: record the commands]]",
+    ),
     "left": Entry(
         "note",
         "no name matches; {numbers} {numbers:is/are} left[[only? , by unit]][[!only? , in the "

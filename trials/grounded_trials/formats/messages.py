@@ -200,11 +200,31 @@ def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
 
 
 @dataclass(frozen=True, eq=False)
-class _JsonNode(Node):
-    """Row i is the parsed value objects[i]; rows without a field are dropped."""
+class ObjectNode(Node):
+    """Row i is the parsed value objects[i]; an object without a field has no row there."""
 
     objects: NDArray[np.object_]
 
+    def among(self, kind: Type, rows: Ints, objects: list[Any]) -> Self:
+        """Return the node of values inside those of this one."""
+        return replace(self, type=kind, rows=rows, objects=as_array(objects))
+
+    def items(self, start: int, stop: int) -> Self:
+        """Return items of lists; whatever else there is has none."""
+        none = (str, dict, int, float, type(None))
+        counts = [0 if isinstance(o, none) else len(o) for o in self.objects]
+        row, index = choose_items(np.array(counts, dtype=np.int64), start, stop)
+        pairs = zip(row.tolist(), index.tolist(), strict=True)
+        kind = self.type.item if isinstance(self.type, Array) else self.type
+        return self.among(kind, self.rows[row], [self.objects[i][j] for i, j in pairs])
+
+    def equals(self, text: str) -> Bools:
+        """Return where a text, or its bytes, equals `text`."""
+        return np.array([o in (text, text.encode()) for o in self.objects], dtype=np.bool_)
+
+
+@dataclass(frozen=True, eq=False)
+class _JsonNode(ObjectNode):
     def sample(self) -> Any:
         """Return the first message, parsed."""
         return self.objects[0]
@@ -215,29 +235,17 @@ class _JsonNode(Node):
 
     def field(self, name: str) -> _JsonNode:
         index = [i for i, o in enumerate(self.objects) if isinstance(o, dict) and name in o]
-        inner = as_array([self.objects[i][name] for i in index])
-        return replace(self, rows=self.rows[np.array(index, dtype=np.int64)], objects=inner)
-
-    def items(self, start: int, stop: int) -> _JsonNode:
-        lists = [o if isinstance(o, list) else [] for o in self.objects]
-        row, index = choose_items(np.array(list(map(len, lists)), dtype=np.int64), start, stop)
-        pairs = zip(row.tolist(), index.tolist(), strict=True)
-        return replace(self, rows=self.rows[row], objects=as_array([lists[i][j] for i, j in pairs]))
+        rows = self.rows[np.array(index, dtype=np.int64)]
+        return self.among(self.type, rows, [self.objects[i][name] for i in index])
 
     def numbers(self) -> Floats:
         values = np.empty(len(self.objects))
         for i, o in enumerate(self.objects):
-            if o is None:
-                values[i] = np.nan
-            elif isinstance(o, int | float):
-                values[i] = _as_float(o)
-            else:
+            if o is not None and not isinstance(o, int | float):
                 at = f"message {self.rows[i]}"
                 raise BadPath("path", expected="number", found=type(o).__name__, at=at)
+            values[i] = np.nan if o is None else _as_float(o)
         return values
-
-    def equals(self, text: str) -> Bools:
-        return np.array([o == text for o in self.objects], dtype=np.bool_)
 
 
 def as_array(objects: list[Any]) -> NDArray[np.object_]:

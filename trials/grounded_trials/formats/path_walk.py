@@ -7,7 +7,7 @@ nodes of many messages by array operations. `number_paths` lists the paths of an
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import islice
@@ -116,29 +116,11 @@ def _field(type: Type, name: str) -> Type:
     if not isinstance(type, Struct):
         raise BadPath("path", at=name, expected="message", found=str(type))
     if name not in type.by_name:
-        raise NoField(type, name)
+        there = [one for one in type.by_name if one != "header"]
+        alike = in_another_unit(name, there)
+        others: dict[str, Any] = {"near": alike[0]} if alike else near(name, there)
+        raise BadPath("given.name", name, kind="field", of=str(type), **others)
     return type.by_name[name].type
-
-
-class NoField(BadPath):
-    """A path names a field that its type does not have.
-
-    Args:
-        type: the type of the message.
-        name: the field.
-        taken: fields that other signals are read from, which are not suggested.
-    """
-
-    def __init__(self, type: Struct, name: str, taken: Collection[str] = ()) -> None:
-        self.type, self.name = type, name
-        left = [one for one in type.by_name if one not in taken and one != "header"]
-        alike = in_another_unit(name, left)
-        others = {"near": alike[0]} if alike else near(name, left)
-        super().__init__("given.name", name, kind="field", of=str(type), **others)
-
-    def beside(self, taken: Collection[str]) -> NoField:
-        """Return it without a suggestion of fields that other signals are read from."""
-        return NoField(self.type, self.name, taken)
 
 
 def _check_end(type: Type, path: MessagePath) -> None:

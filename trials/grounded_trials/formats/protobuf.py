@@ -7,24 +7,22 @@ one form, are read by `uniform_doubles` without it.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from grounded_trials.formats.bad import BadMessage, BadSchema
 from grounded_trials.formats.mcap_records import windows
 from grounded_trials.formats.messages import (
     Array,
-    Bools,
     Floats,
     Ints,
     Node,
+    ObjectNode,
     Struct,
     as_array,
-    choose_items,
 )
 
 FIXED64, BYTES = 1, 2
@@ -42,11 +40,8 @@ class _Entry:
         return True
 
 
-@dataclass(frozen=True, eq=False)
-class _ProtobufNode(Node):
-    """Row i is the value objects[i]; an absent field has its default, an absent message no row."""
-
-    objects: NDArray[np.object_]
+class _ProtobufNode(ObjectNode):
+    """An absent field has its default, an absent message no row."""
 
     def field(self, name: str) -> _ProtobufNode:
         assert isinstance(self.type, Struct)
@@ -57,21 +52,10 @@ class _ProtobufNode(Node):
         inner = [getattr(o, name) for o in node.objects]
         if isinstance(kind, Array) and isinstance(kind.item, Struct):  # a map is a list of entries
             inner = [[*map(_Entry, o, o.values())] if hasattr(o, "values") else o for o in inner]
-        return replace(node, type=kind, objects=as_array(inner))
-
-    def items(self, start: int, stop: int) -> _ProtobufNode:
-        assert isinstance(self.type, Array)
-        counts = np.array([len(o) for o in self.objects], dtype=np.int64)
-        row, index = choose_items(counts, start, stop)
-        pairs = zip(row.tolist(), index.tolist(), strict=True)
-        inner = as_array([self.objects[i][j] for i, j in pairs])
-        return replace(self, type=self.type.item, rows=self.rows[row], objects=inner)
+        return node.among(kind, node.rows, inner)
 
     def numbers(self) -> Floats:
         return np.array(self.objects, dtype=np.float64)
-
-    def equals(self, text: str) -> Bools:
-        return np.array([o in (text, text.encode()) for o in self.objects], dtype=np.bool_)
 
 
 def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:

@@ -19,7 +19,8 @@ so are lists in lists, with which it takes seconds for a line.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -184,31 +185,54 @@ def parse_idl(text: str, name: str) -> Struct:
     return types.struct(name.replace("::", "/"), 0)
 
 
-class _IdlTypes:
-    """Builds each message type of rosbags' descriptions once; an enum is a number."""
+class _Types(ABC):
+    """Builds each message type of a definition once."""
 
-    def __init__(self, structs: dict[str, Any], enums: set[str]) -> None:
-        self.structs, self.enums = structs, enums
+    def __init__(self) -> None:
         self.built: dict[str, Struct] = {}
+
+    @abstractmethod
+    def fields(self, name: str, depth: int) -> Iterator[Field]:
+        """Yield the fields of a type; KeyError if it is not defined."""
 
     def struct(self, name: str, depth: int) -> Struct:
         if name not in self.built:
-            if depth > DEPTH_LIMIT or name not in self.structs:
-                why = "nested" if name in self.structs else "lacks"
-                raise BadSchema("decode", what="definition", why=why, at=name[:80])
-            fields = [Field(key, self.type(one, depth)) for key, one in self.structs[name][1]]
-            # ROS gives a struct without members a dummy member of one byte.
-            fields = [f for f in fields if f.name != "structure_needs_at_least_one_member"]
-            self.built[name] = Struct(name, tuple(fields))
+            if depth > DEPTH_LIMIT:
+                raise BadSchema("decode", what="definition", why="nested", at=name[:80])
+            try:
+                self.built[name] = Struct(name, tuple(self.fields(name, depth)))
+            except KeyError as error:
+                at = str(error.args[0])[:80]
+                raise BadSchema("decode", what="definition", why="lacks", at=at) from None
         return self.built[name]
+
+    @staticmethod
+    def count(text: int | str) -> int:
+        """Return the number of an array's items."""
+        if len(str(text)) > 9 or not 0 <= int(text) <= COUNT_LIMIT:
+            raise BadSchema("decode", what="definition", why="long", at=str(text)[:20])
+        return int(text)
+
+
+class _IdlTypes(_Types):
+    """The types in rosbags' descriptions; an enum is a number."""
+
+    def __init__(self, structs: dict[str, Any], enums: set[str]) -> None:
+        super().__init__()
+        self.structs, self.enums = structs, enums
+
+    def fields(self, name: str, depth: int) -> Iterator[Field]:
+        for key, described in self.structs[name][1]:
+            # ROS gives a struct without members a dummy member of one byte.
+            if key != "structure_needs_at_least_one_member":
+                yield Field(key, self.type(described, depth))
 
     def type(self, described: Any, depth: int) -> Type:
         kind, inner = described[0].name, described[1]
         if kind in ("ARRAY", "SEQUENCE"):
             item, count = inner
-            if not 0 <= count <= COUNT_LIMIT:
-                raise BadSchema("decode", what="definition", why="long", at=str(count)[:20])
-            return Array(self.type(item, depth), count if kind == "ARRAY" else None)
+            most = self.count(count)
+            return Array(self.type(item, depth), most if kind == "ARRAY" else None)
         if kind == "BASE":
             named = NUMBERS | {"octet": Number("u1"), "byte": Number("u1")}
             texts = {"string": Text(1), "wstring": Text(0)}
@@ -275,44 +299,29 @@ def _service_event(texts: dict[str, str], root: str) -> None:
     )
 
 
-class _RosTypes:
-    """Builds each message type once."""
+class _RosTypes(_Types):
+    """The types of the texts of messages, by package/Type."""
 
     def __init__(self, texts: dict[str, str], ros1: bool) -> None:
+        super().__init__()
         self.texts, self.ros1 = texts, ros1
-        self.built: dict[str, Struct] = {}
 
-    def struct(self, name: str, depth: int) -> Struct:
-        if name in self.built:
-            return self.built[name]
-        if depth > DEPTH_LIMIT:
-            raise BadSchema("decode", what="definition", why="nested", at=name)
+    def fields(self, name: str, depth: int) -> Iterator[Field]:
         package = name.split("/")[0] if "/" in name else ""
-        fields = []
-        for line in self.texts[name].split("\n"):
-            stripped = line.strip()
-            if not stripped or stripped.startswith("#"):
+        for line in map(str.strip, self.texts[name].split("\n")):
+            if not line or line.startswith("#"):
                 continue
-            match = _FIELD.match(stripped)
-            if not match:
-                raise BadSchema("decode", what="definition", why="unexpected", at=stripped[:60])
-            if match["constant"]:
-                continue
-            fields.append(Field(match["name"], self.type(match, package, depth)))
-        self.built[name] = Struct(name, tuple(fields))
-        return self.built[name]
+            if (match := _FIELD.match(line)) is None:
+                raise BadSchema("decode", what="definition", why="unexpected", at=line[:60])
+            if not match["constant"]:
+                yield Field(match["name"], self.type(match, package, depth))
 
     def type(self, match: re.Match[str], package: str, depth: int) -> Type:
-        kind = self.named(match["type"], package, depth)
-        array = match["array"]
+        kind, array = self.named(match["type"], package, depth), match["array"]
         if array is None:
             return kind
         count = array[1:-1]
-        if not count or count.startswith("<="):
-            return Array(kind)
-        if len(count) > 9 or int(count) > COUNT_LIMIT:
-            raise BadSchema("decode", what="definition", why="long", at=count[:20])
-        return Array(kind, int(count))
+        return Array(kind, None if not count or count.startswith("<=") else self.count(count))
 
     def named(self, name: str, package: str, depth: int) -> Type:
         if name in NUMBERS:
@@ -325,7 +334,7 @@ class _RosTypes:
             kind = "u4" if name == "time" else "i4"
             return Struct(name, (Field("sec", Number(kind)), Field("nsec", Number(kind))))
         names = [_short(name), f"{package}/{name}", f"std_msgs/{name}"]
-        for full in names if "/" not in name else names[:1]:
-            if full in self.texts:
-                return self.struct(full, depth + 1)
-        raise BadSchema("decode", what="definition", why="lacks", at=name)
+        found = [full for full in (names if "/" not in name else names[:1]) if full in self.texts]
+        if not found:
+            raise BadSchema("decode", what="definition", why="lacks", at=name)
+        return self.struct(found[0], depth + 1)

@@ -7,7 +7,6 @@ times: when it was logged, when it was published, and its header's stamp.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -32,7 +31,7 @@ from grounded_trials.formats.messages import (
     Type,
     json_messages,
 )
-from grounded_trials.formats.path_walk import Bound, NoField, Values, bind, evaluate
+from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
 from grounded_trials.formats.protobuf import message_class, protobuf_messages
 from grounded_trials.formats.schemas import struct_of
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
@@ -194,10 +193,6 @@ class _Log:
     def _misfit(
         self, channel: Channel, collector: _Collector, error: Bad, at: float | None = None
     ) -> GroundedError:
-        if isinstance(error, NoField):
-            mapped = (c.path for c in self.collectors if c is not collector)
-            same = [path for path in mapped if path.topic == channel.topic]
-            error = error.beside({re.split(r"[./]", path.text)[-1].strip('"') for path in same})
         facts: dict[str, Any] = {
             "topic": channel.topic,
             "type": self.topics[channel.topic],

@@ -319,7 +319,7 @@ class _Table:
             fits = any(True for _ in _readings(one.slope * by[1] / by[0], stated, by))
             if bare and not fits and abs(one.correlation) < SURELY:
                 continue  # neither name nor size: a voltage follows the speed that it drives
-            if not first and len(bare) == 2 and not self._tenfold(one):
+            if not first and len(bare) == 2 and one.tenfold is None:
                 continue
             points = _capped(one) - 1.5 * (not fits) - 0.5 * (one.correlation < 0)
             for own_key, partner in (((q, a), (w, b)), ((w, b), (q, a))):
@@ -343,18 +343,12 @@ class _Table:
             n.path
             for n in free
             if not (unit in LENGTHS and is_angle(n.path))
-            and (not unit or not (n.said or n.known) or self._has(n, unit))
+            and (
+                not unit
+                or not (n.said or n.known)
+                or factor_between(n.said or n.known, unit) is not None
+            )
         ]
-
-    @staticmethod
-    def _tenfold(like: Follows) -> bool:
-        """Return whether a number is surely a rate, in units that differ by a power of ten."""
-        power = 10.0 ** round(np.log10(max(like.slope, 1e-9)))
-        return like.correlation > SURELY and abs(like.slope / power - 1) < SAME
-
-    @staticmethod
-    def _has(number: _Number, unit: str) -> bool:
-        return factor_between(number.said or number.known, unit) is not None
 
     def _likes(self, first: Sequence[str], second: Sequence[str]) -> dict[tuple[str, str], Follows]:
         """Return which numbers follow which, and how."""
@@ -466,7 +460,11 @@ class _Table:
         some = some or [n for n in self.numbers if (role.name, n.path) in self.named]
         some = some or [n for n in may if n.path in possible and not n.said]
         some.sort(key=lambda n: -float(row[self.at[n.path]]))
-        return Guess(role.name, "", "", False, tuple(n.path for n in some)[:MOST_CANDIDATES])
+        empty = [t.topic for t in self.log.topics if not t.messages]
+        empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
+        why = (found("start.still", *empty, empty=True),) if empty and role.sent else ()
+        others = tuple(n.path for n in some)[:MOST_CANDIDATES]
+        return Guess(role.name, "", "", False, others, None, why)
 
     def finished(self, guess: Guess) -> Guess:
         """Return a guess with its clock, its range, and the unit that the log states."""

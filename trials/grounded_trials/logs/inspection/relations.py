@@ -34,9 +34,11 @@ class Follows:
     slope: float
 
     @property
-    def fits(self) -> bool:
-        """Whether the second is the derivative of the first, in sign and size."""
-        return self.correlation > SURELY and abs(self.slope - 1) < SAME
+    def tenfold(self) -> float | None:
+        """The power of ten by which it is surely larger than the derivative, None otherwise."""
+        power = 10.0 ** round(np.log10(max(self.slope, 1e-9)))
+        surely = self.correlation > SURELY and abs(self.slope / power - 1) < SAME
+        return power if surely else None
 
     @property
     def points(self) -> float:
@@ -157,8 +159,7 @@ class Signals:
         found = []
         for a, b in permutations(paths, 2):
             like = self.follows(a, b)
-            power = 10.0 ** round(np.log10(max(like.slope, 1e-9)))
-            if like.correlation > SURELY and abs(like.slope / power - 1) < SAME:
+            if (power := like.tenfold) is not None:
                 found.append((like.correlation, a, b, 1 / power))
         pairs: dict[str, tuple[str, float]] = {}
         for _, a, b, times in sorted(found, reverse=True):
