@@ -97,6 +97,12 @@ class _CdrNode(Node):
             length -= (counts > 0) & (last == 0)
         return texts_equal(self.buffer, body.pos, length, text.encode())
 
+    def texts(self) -> list[str]:
+        counts, body = self._counts()
+        places = zip(body.pos.tolist(), counts.tolist(), strict=True)
+        parts = (self.buffer[at : at + count] for at, count in places)
+        return [part.rstrip(b"\0").decode("utf-8", "replace") for part in parts]
+
     def _at(self, pos: Ints) -> _CdrNode:
         return replace(self, pos=pos)
 

@@ -151,6 +151,10 @@ class Node:
         """Return where a text equals `text`."""
         raise NotImplementedError
 
+    def texts(self) -> list[str]:
+        """Return the texts, one per row."""
+        raise NotImplementedError
+
 
 def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
     """Return the items that a slice selects, as (row, index), for arrays of counts[row] items.
@@ -221,6 +225,10 @@ class ObjectNode(Node):
     def equals(self, text: str) -> Bools:
         """Return where a text, or its bytes, equals `text`."""
         return np.array([o in (text, text.encode()) for o in self.objects], dtype=np.bool_)
+
+    def texts(self) -> list[str]:
+        """Return the objects as texts."""
+        return list(map(str, self.objects))
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
 from itertools import combinations
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,6 +25,7 @@ from grounded_trials.formats.messages import (
     Dynamic,
     Floats,
     Ints,
+    Struct,
 )
 from grounded_trials.formats.path_walk import (
     FIELD_LIMIT,
@@ -40,7 +39,10 @@ from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.signals import Decoder, decoder_of
 
-NAMING = "/JointState", "/JointTrajectoryControllerState"  # types of messages that name joints
+NAMING = {  # types of messages that name joints, and their field
+    "/JointState": "name",
+    "/JointTrajectoryControllerState": "joint_names",
+}
 NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
 DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
 GAP = 10.0  # intervals; longer gaps are reported
@@ -304,8 +306,6 @@ class _Topic:
         self.log_times.append(batch.log_times)
         if self.problem or not len(batch):
             return
-        if self.schema is not None and self.schema.name.endswith(NAMING):
-            self.joints |= _joints_in(batch, self.channel.encoding, self.schema)
         stride = 1 + self.looked // DECODED
         chosen = np.zeros(len(batch), dtype=np.bool_)
         chosen[::stride] = True
@@ -314,6 +314,7 @@ class _Topic:
             if self.decoder is None:
                 self.decoder = decoder_of(self.channel, self.schema)
                 self._find_paths(batch)
+            self.joints |= _joints_in(batch, self.decoder)
             for part in self.decoder.parts(batch.take(chosen)):
                 self._look(self.decoder, part)
         except Bad as error:
@@ -369,32 +370,15 @@ class _Topic:
         )
 
 
-@cache
-def _types_of(ros1: bool) -> Any:
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
-
-
-def _joints_in(batch: Messages, encoding: str, schema: Schema) -> set[tuple[str, ...]]:
+def _joints_in(batch: Messages, decoder: Decoder) -> set[tuple[str, ...]]:
     """Return the lists of joints' names in the first and last message of a batch."""
-    from rosbags.typesys import get_types_from_msg
-
-    store = _types_of(encoding == "ros1")
-    read = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
-    kind, listed = "sensor_msgs/msg/JointState", "name"
-    if schema.name.endswith(NAMING[1]):
-        kind, listed = "control_msgs/msg/JointTrajectoryControllerState", "joint_names"
-        defined = get_types_from_msg(schema.data.decode(errors="replace"), kind)
-        store.register({name: one for name, one in defined.items() if name not in store.types})
-    names = set()
-    for i in {0, len(batch) - 1}:
-        data = batch.buffer[int(batch.starts[i]) : int(batch.ends[i])]
-        try:
-            names.add(tuple(getattr(read(data, kind), listed)))
-        except (AttributeError, KeyError, ValueError, IndexError, AssertionError):
-            continue  # not a ROS encoding: joints have no names
-    return names
+    kind = decoder.type
+    listed = next((field for name, field in NAMING.items() if decoder.name.endswith(name)), "")
+    if not isinstance(kind, Struct) or listed not in kind.by_name:
+        return set()
+    ends = [slice(0, 1), slice(len(batch) - 1, len(batch))]
+    roots = (decoder.root(batch.buffer, batch.starts[one], batch.ends[one]) for one in ends)
+    return {tuple(root.field(listed).items(0, -1).texts()) for root in roots}
 
 
 def _telling(ranges: Mapping[str, _Range]) -> dict[str, _Range]:
