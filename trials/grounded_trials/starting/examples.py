@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import inspect
 import shutil
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
@@ -25,9 +26,21 @@ class Example:
     """One example: its line in the list, and the sources of its files."""
 
     text: str
-    task: Callable[[], Task]
-    model: str  # import name of the crude model's module, copied to model.py
+    model: str  # module of the crude model, copied to model.py
     real: str  # contents of real.py
+    tasks: str  # module and function (..., model) of its task
+    arguments: tuple[str, ...] = ()
+
+    def task(self) -> Task:
+        """Return the task with the crude model."""
+        module, _, name = self.tasks.rpartition(".")
+        made: Task = getattr(import_module(module), name)(*self.arguments, self.module.model)
+        return made
+
+    @property
+    def module(self) -> ModuleType:
+        """The module of the crude model."""
+        return import_module(self.model)
 
 
 _REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never reads it."""
@@ -55,55 +68,30 @@ from grounded.experiments.pendulum import model
 '''
 
 
-def _car(name: str) -> Callable[[], Task]:
-    def task() -> Task:
-        from grounded.experiments.car_tasks import car_task
-        from grounded.models.car import model
-
-        return car_task(name, model)
-
-    return task
-
-
-def _flight() -> Task:
-    from grounded.experiments.figure8 import flight_task
-    from grounded.models.aircraft import model
-
-    return flight_task(model)
-
-
-def _pendulum() -> Task:
-    from grounded.experiments.pendulum import pendulum_task
-    from grounded.models.pendulum import model
-
-    return pendulum_task(model)
-
-
-_CAR = "grounded.models.car"
+_CAR = "grounded.models.car", _REAL_CAR, "grounded.experiments.car_tasks.car_task"
 EXAMPLES: Mapping[str, Example] = {
     "car-turn": Example(
-        "RC car, open loop: a quarter turn from standstill", _car("turn"), _CAR, _REAL_CAR
+        "RC car, open loop: a quarter turn from standstill", *_CAR, arguments=("turn",)
     ),
     "car-circle": Example(
-        "RC car, closed loop: 1.4 m/s on a 1 m circle", _car("circle"), _CAR, _REAL_CAR
+        "RC car, closed loop: 1.4 m/s on a 1 m circle", *_CAR, arguments=("circle",)
     ),
     "car-figure8": Example(
         "RC car, closed loop: a figure-8, 1.4 m/s straights, 1.0 m/s turns",
-        _car("figure8"),
-        _CAR,
-        _REAL_CAR,
+        *_CAR,
+        arguments=("figure8",),
     ),
     "flight-figure8": Example(
         "fixed-wing aircraft, 60 s: a figure-8 at fixed altitude",
-        _flight,
         "grounded.models.aircraft",
         _REAL_AIRCRAFT,
+        "grounded.experiments.figure8.flight_task",
     ),
     "pendulum": Example(
         "pendulum: swing up to standing, the smallest example",
-        _pendulum,
         "grounded.models.pendulum",
         _REAL_PENDULUM,
+        "grounded.experiments.pendulum.pendulum_task",
     ),
 }
 
@@ -127,17 +115,15 @@ def write_example(folder: Path, name: str) -> None:
     Raises:
         GroundedError: if the folder already holds a workspace, or can't be written.
     """
-    import importlib
-
     chosen = example(name)
     refuse_existing(folder, [FILE])
-    task, module = chosen.task(), importlib.import_module(chosen.model)
+    task = chosen.task()
     columns = {
         state: task.target[:, i]
         for i, state in enumerate(task.model.state_names)
         if np.isfinite(task.target[:, i]).all()
     }
-    files = {"target.csv": target_text(task.dt, columns), "model.py": _source(module)}
+    files = {"target.csv": target_text(task.dt, columns), "model.py": _source(chosen.module)}
     files |= {"real.py": chosen.real, FILE: toml_of(task, name)}
     refuse_existing(
         folder, [file for file, text in files.items() if not _holds(folder / file, text)]
