@@ -15,12 +15,13 @@ from dataclasses import dataclass, replace
 from enum import Enum
 from functools import cache, partial
 from itertools import combinations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from grounded.accounts.judge import contradicted
 from grounded.accounts.motion import MARGIN
+from grounded.accounts.reported import tables
 from grounded.accounts.sent import (
     CLEAR,
     DECISIVE,
@@ -57,12 +58,10 @@ OTHERS = 20  # number of latest candidates to compare with
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
 NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
 TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
-ROUNDS = 12  # Gauss-Newton iterations; more than two are only needed at limits or wrapped angles
 AGES = (0.0, 1.0, 2.0)  # [steps] of the states acted on that rows are first compared with
 SHARES = np.arange(1, 49) / 50  # of its last value that a first-order filter keeps
 COARSE = 100  # steps of a run at which a log may begin, first tried
 GROSS = 10.0  # smallest factor, or its inverse, that the prediction alone tells
-CUT = 0.05  # least share of the steps at a cut
 
 
 class Kind(Enum):
@@ -137,53 +136,22 @@ def likeliest(some: Iterable[Story | None], as_logged: Story) -> Story:
     return min(better, key=lambda one: one.left, default=as_logged)
 
 
-@dataclass(frozen=True, eq=False)
-class Row:
+class Row(NamedTuple):
     """One entry of the table: what the policy was given, and what it was, before any score.
 
     Args:
         policy: as it acts.
-        log: price of the story that the log is so [nats]; None if it is none.
-        program: price of the story that the robot's program made it so [nats]; None likewise.
-        names: columns that are multiplied, moved or exchanged.
-        by: the factor.
-        order: every column, as it is passed; () if in the right order.
-        off: what is added to the states (n,).
-        share: of its last value that a filter of the states `names` keeps.
-        told: what a program did, or what is wrong with the log; None for columns times a factor.
+        run: the trial with its columns as the policy got them.
+        stories: that the log is so, or that the robot's program made it so; not scored yet.
         steps: of the run that were before it began.
         fitted: a number of it is fitted to the trial.
     """
 
     policy: Policy
-    log: float | None = None
-    program: float | None = None
-    names: tuple[str, ...] = ()
-    by: float = 1.0
-    order: tuple[str, ...] = ()
-    off: Array | None = None
-    share: float = 0.0
-    told: Finding | None = None
-    of_log: Finding | None = None
+    run: Trial
+    stories: tuple[Story, ...]
     steps: int = 0
     fitted: bool = False
-
-    def of(self, trial: Trial) -> Trial:
-        """Return a trial with its columns as the policy got them."""
-        states, inputs, held = trial.states, trial.inputs, trial.start_inputs
-        if self.share:
-            which = np.isin(trial.state_names, self.names)
-            states = np.where(which, filtered(states, np.array([self.share]))[0], states)
-        elif self.order:
-            every = (*trial.state_names, *trial.input_names)
-            at, n = [every.index(name) for name in self.order], len(trial.state_names)
-            states, sent = states[:, at[:n]], [k - n for k in at[n:]]
-            inputs, held = inputs[:, sent], None if held is None else held[sent]
-        elif self.off is not None:
-            states = states + self.off
-        elif self.names:
-            return multiplied(trial, self.names, self.by)
-        return replace(trial, states=states, inputs=inputs, start_inputs=held)
 
 
 def multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
@@ -229,10 +197,8 @@ def stories(
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
-    rows = rows_of(task, own, trial, acts=acts, logged=logged, waits=waits)
-    some = list[Story]()
-    for row in nearest(rows, trial):
-        some += stories_of(row, task, own, trial, plain)
+    rows = nearest(rows_of(task, own, trial, acts=acts, logged=logged, waits=waits))
+    some = [one for row in rows for one in stories_of(row, task, own, trial, plain)]
     if not some and not plain.beyond:
         some += _by_motion(task.model, own, trial, plain, logged)
     return sorted(some, key=lambda one: one.left)
@@ -248,35 +214,22 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
         trial: the trial, not longer than its run.
         plain: the comparison of its commands with the policy's.
     """
-    run = row.of(trial)
-    fit = follows(row.policy, run, latest(task))
-    if fit is None:
+    fit = follows(row.policy, row.run, latest(task))
+    if fit is None or not fit.alike:
         return
     plain = replace(plain, off=plain.off[: len(fit.off)])
-    before, motion, first = _left(plain), apart(own, trial, row.steps), row.steps
-    unit = row.of_log is None and not row.fitted  # a known one, or a sign
-    least = ALIKE if plain.alike else MARGIN
-
-    def gained(left: float, price: float) -> bool:
-        return bool(np.log((before + FINE) / (left + FINE)) >= price)
-
-    left, tells = _left(fit), _tells(plain, fit)
-    same: dict[str, Any] = {"names": row.names, "by": row.by}
-    if row.log is not None and fit.alike and (tells or unit) and fit.error < EXPLAINED:
-        price = row.log + (MARGIN if unit else least)
-        if gained(left, price) and apart(own, run, first) <= motion:
-            kind = Kind.UNIT if row.of_log is None else Kind.LOG
-            yield scored(
-                kind, row.of_log, own, run, left, first, price=row.log, rerun=row.steps > 0, **same
-            )
-    if row.program is None or plain.beyond:
-        return
-    share = _moved(own, trial, fit)
-    known = fit.alike and tells and fit.error < EXPLAINED * share
-    if known and gained(left / share, row.program + least):
-        yield scored(
-            Kind.PROGRAM, row.told, own, trial, left / share, first, price=row.program, **same
-        )
+    tells, motion = _tells(plain, fit), apart(own, trial, row.steps)
+    for story in row.stories:
+        passed = story.kind is Kind.PROGRAM
+        known = story.kind is Kind.UNIT and not row.fitted  # a unit that exists, or a sign
+        # a program's commands that hardly move are near to any that hardly move
+        share = _moved(own, trial, fit) if passed else 1.0
+        there = motion if passed else apart(own, row.run, row.steps)
+        sound = (tells or known) and fit.error < EXPLAINED * share and there <= motion
+        left, least = _left(fit) / share, ALIKE if plain.alike and not known else MARGIN
+        gained = np.log((_left(plain) + FINE) / (left + FINE)) >= story.price + least
+        if sound and gained and not (passed and plain.beyond):
+            yield replace(story, commands=float(np.log(left + FINE)), motion=there)
 
 
 def _left(ran: Following) -> float:
@@ -285,10 +238,7 @@ def _left(ran: Following) -> float:
 
 
 def _moved(own: Ran, trial: Trial, fit: Following) -> float:
-    """Return how far the commands that moved most did, relative to their size, at most 1.
-
-    What a program sends that hardly moves is near to any commands that hardly move.
-    """
+    """Return how far the commands that moved most did, relative to their size, at most 1."""
     most = np.abs(trial.inputs - own.policy.past).max(axis=0) * FINE / fit.fine
     return float(np.clip(most.max(), FINE, 1.0))
 
@@ -334,14 +284,14 @@ def _by_motion(
     yield from sorted(best, key=lambda one: one.left)[:1]
 
 
-def nearest(rows: Sequence[Row], trial: Trial) -> list[Row]:
+def nearest(rows: Sequence[Row]) -> list[Row]:
     """Return the rows that explain the commands best, each policy's compared at once."""
     score, groups = dict[int, float](), dict[int, list[int]]()
     for k, row in enumerate(rows):
         groups.setdefault(id(row.policy), []).append(k)
     for some in groups.values():
-        policy, runs = rows[some[0]].policy, [rows[k].of(trial) for k in some]
-        T, past = min(trial.steps, policy.horizon), runs[0].start_inputs
+        policy, runs = rows[some[0]].policy, [rows[k].run for k in some]
+        T, past = min(runs[0].steps, policy.horizon), runs[0].start_inputs
         states = np.stack([run.states[:T] for run in runs])
         sent = np.clip(np.stack([run.inputs[:T] for run in runs]), policy.low, policy.high)
         left = np.full(len(some), np.inf)
@@ -354,9 +304,7 @@ def nearest(rows: Sequence[Row], trial: Trial) -> list[Row]:
                 square = (((a - b) / size[:, None]) ** 2).mean(axis=2)
                 left = np.minimum(left, np.sqrt(np.median(square, axis=1) + 1e-3 * square.mean(1)))
         for k, error in zip(some, left, strict=True):
-            score[k] = float(np.log(error + FINE)) + min(
-                one for one in (rows[k].log, rows[k].program) if one is not None
-            )
+            score[k] = np.log(error + FINE) + min(one.price for one in rows[k].stories)
     return [rows[k] for k in sorted(score, key=lambda k: score[k])[:ROWS_IN_FULL]]
 
 
@@ -382,41 +330,43 @@ def rows_of(
         logged: the states that a column holds.
         waits: whether its log begins before any run; None if that is unknown.
     """
-    model, held = task.model, np.abs(trial.inputs - own.policy.past).max(axis=1) <= 1e-9
-    scales = [*_scales(task, own, trial.inputs, logged)]
-    return [
-        *scales,
-        *_orders(model, own, logged),
-        *_times(own, unsent=bool(held[0]), over=bool(held.all()) and not acts),
-        *_fitted_scales(own.policy, trial, scales, [n for n in model.state_names if n in logged]),
-        *_origins(model, own, trial, logged),
-        *_smoothed(model, own, trial),
-        *_clipped(own, trial),
-        *(_later(own, trial, waits) if waits is not None else ()),
-    ]
+    scales, fed = [*_scales(task, own, trial, logged)], own.policy.gain is not None
+    some = [*scales, *_orders(task.model, own, trial, logged)]
+    some += _times(own, trial, acts=acts)
+    if fed:
+        some += _fitted(task.model, own, trial, scales, logged)
+        some += _smoothed(task.model, own, trial)
+    some += _clipped(own, trial)
+    return [*some, *(_later(own, trial, waits) if waits is not None else ())]
 
 
-def _scales(task: Task, own: Ran, inputs: Array, logged: Sequence[str]) -> Iterator[Row]:
+def _passed(
+    code: str, own: Ran, price: float = MARGIN, names: Sequence[str] = (), **facts: Any
+) -> Story:
+    """Return the story that the robot's program gave its policy something else, or ran it so."""
+    told = found(code, ran=own.id, **facts)
+    return Story(Kind.PROGRAM, told, price=price, names=tuple(names), by=facts.get("times", 1.0))
+
+
+def _scales(task: Task, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
     """Yield columns in another unit or of the other sign: of the log, or as a program passed them.
 
     At the limits one state may explain as much as all, but a program passes all in one unit.
     """
-    model, fed = task.model, own.policy.gain is not None
+    model, fed, inputs = task.model, own.policy.gain is not None, trial.inputs
     names, guessed = (*model.state_names, *model.input_names), {*model.state_names} - {*logged}
     for one in (*full_scales(task, inputs), *of_commands(model, inputs)):
         group, by = tuple(names[k] for k in one.columns), 1 / one.factor
-        passed = max(one.columns) < model.n and fed
-        unit = unit_named((model.states[n] for n in group), by) if passed else ""
-        how: dict[str, Any] = {"unit": unit} if unit else {"times": by}
-        told = found("run.passed", ran=own.id, states=group, order=model.state_names, **how)
-        yield Row(
-            own.policy,
-            log=one.price if {*group} - guessed else None,
-            program=MARGIN * (1 - len(group) / model.n) if passed else None,
-            names=group,
-            by=by,
-            told=told,
-        )
+        some = [Story(Kind.UNIT, price=one.price, names=group, by=by)] * bool({*group} - guessed)
+        if max(one.columns) < model.n and fed:
+            unit = unit_named((model.states[n] for n in group), by)
+            how: dict[str, Any] = {"unit": unit} if unit else {"times": by}
+            price, how = MARGIN * (1 - len(group) / model.n), how | {"order": model.state_names}
+            some.append(
+                replace(_passed("run.passed", own, price, group, states=group, **how), by=by)
+            )
+        if some:
+            yield Row(own.policy, one.mended(trial), tuple(some))
 
 
 def full_scales(task: Task, inputs: Array) -> Iterator[Account]:
@@ -451,58 +401,64 @@ def of_full_scale(task: Task, names: Sequence[str], by: float) -> str:
     return part and f"{part} of {with_unit(f'{full:g}', task.model.inputs[names[0]])}"
 
 
-def _orders(model: Model, own: Ran, logged: Sequence[str]) -> Iterator[Row]:
+def _orders(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
     """Yield wrong orders that occur: two exchanged, some of the first ones last, sorted.
 
     A program has positions before velocities where the model has them after, for example; a log has
     two columns in each other's place.
     """
-    right, sent = model.state_names, model.input_names
-    for some in (right if own.policy.gain is not None else (), sent):
-        pairs = combinations(some, 2)
-        orders: dict[tuple[str, ...], tuple[str, ...]] = {
-            tuple({a: b, b: a}.get(n, n) for n in some): (a, b) for a, b in pairs
-        }
-        if some is right:
-            turned = [right[k:] + right[:k] for k in range(1, len(right))]
-            orders |= {one: () for one in (*turned, tuple(sorted(right))) if one not in orders}
-        for order, pair in orders.items():
-            if order == some:
-                continue
-            moved = tuple(was for was, now in zip(some, order, strict=True) if was != now)
-            log = found("log.exchange", *pair, ran=own.id) if pair else None
-            yield Row(
-                own.policy,
-                log=MARGIN if pair and (some is sent or {*pair} <= {*logged}) else None,
-                program=MARGIN * (1 - len(moved) / model.n) if some is right else None,
-                names=moved,
-                order=(*order, *sent) if some is right else (*right, *order),
-                told=found("run.passed", ran=own.id, passed=order, order=right),
-                of_log=log,
+    right, n = model.state_names, model.n
+    every = (*right, *model.input_names)
+    for some in (right if own.policy.gain is not None else (), model.input_names):
+        first = every.index(some[0]) if some else 0
+        for pair in combinations(some, 2):
+            a, b = (every.index(name) for name in pair)
+            run = Account("exchange", pairs=((a, b),)).mended(trial)
+            log = Story(
+                Kind.LOG, found("log.exchange", *pair, ran=own.id), names=pair, price=MARGIN
             )
+            told = [log] if first == n or {*pair} <= {*logged} else []
+            if first < n:
+                order = tuple({a: b, b: a}.get(k, k) for k in range(n))
+                told.append(_misordered(model, own, order))
+            yield Row(own.policy, run, tuple(told))
+        ways = [(*range(k, n), *range(k)) for k in range(1, n)] if first < n else []
+        ways += [tuple(sorted(range(n), key=lambda k: right[k]))] if first < n else []
+        for order in dict.fromkeys(one for one in ways if _moves(one) > 2):
+            run = replace(trial, states=trial.states[:, order])
+            yield Row(own.policy, run, (_misordered(model, own, order),))
 
 
-def _times(own: Ran, *, unsent: bool, over: bool) -> Iterator[Row]:
+def _moves(order: Sequence[int]) -> int:
+    return sum(k != at for at, k in enumerate(order))
+
+
+def _misordered(model: Model, own: Ran, order: Sequence[int]) -> Story:
+    """Return the story that a program passed the states in this order."""
+    passed, right = tuple(model.state_names[k] for k in order), model.state_names
+    moved = [name for name, now in zip(right, passed, strict=True) if name != now]
+    price = MARGIN * (1 - len(moved) / model.n)
+    return _passed("run.passed", own, price, moved, passed=passed, order=right)
+
+
+def _times(own: Ran, trial: Trial, *, acts: bool) -> Iterator[Row]:
     """Yield the policy at other times than the run's, and without its feedback.
 
     Args:
         own: the candidate.
-        unsent: whether the first command is the one held before the run, so that none was sent.
-        over: whether all are.
+        trial: its run.
+        acts: whether other commands than those held before a run are sent elsewhere in its log.
     """
-    policy, ran = own.policy, own.id
-    for unit, factor in TIMES.items():
-        if factor < 1 or not unsent:
-            told = found("run.passed", ran=ran, time=unit)
-            yield Row(_at_times(policy, factor), program=MARGIN, told=told)
-    if over:
-        told = found("run.passed", ran=ran, time="a clock")
-        yield Row(_at_times(policy, np.inf), program=MARGIN, told=told)
-    told = found("run.passed", ran=ran, time="no unit: it stays 0")
-    yield Row(_at_times(policy, 0.0), program=MARGIN, told=told)
+    policy = own.policy
+    held = np.abs(trial.inputs - policy.past).max(axis=1) <= 1e-9  # none was sent
+    times = {unit: f for unit, f in TIMES.items() if f < 1 or not held[0]}
+    times |= {} if acts or not held.all() else {"a clock": np.inf}
+    for unit, factor in (times | {"no unit: it stays 0": 0.0}).items():
+        story = _passed("run.passed", own, time=unit)
+        yield Row(_at_times(policy, factor), trial, (story,))
     if policy.gain is not None:
-        told = found("run.unfed", ran=ran)
-        yield Row(replace(policy, gain=None, reference=None), program=MARGIN, told=told)
+        alone = replace(policy, gain=None, reference=None)
+        yield Row(alone, trial, (_passed("run.unfed", own),))
 
 
 def _at_times(policy: Policy, factor: float) -> Policy:
@@ -524,108 +480,65 @@ def _at_times(policy: Policy, factor: float) -> Policy:
     return replace(policy, feedforward=sent, gain=gain, reference=policy.reference[step])
 
 
-def _fitted_scales(
-    policy: Policy, trial: Trial, known: Sequence[Row], states: Sequence[str]
+def _fitted(
+    model: Model, own: Ran, trial: Trial, known: Sequence[Row], logged: Sequence[str]
 ) -> Iterator[Row]:
-    """Yield each group of columns times the factor, unlike the known ones, that fits best."""
-    tried = {(row.names, round(float(np.log(abs(row.by))), 2), row.by > 0) for row in known}
-    groups = [row.names for row in known if row.log is not None]
-    groups = list(dict.fromkeys((*groups, tuple(states))))
-    columns = np.array([[name in some for name in trial.state_names] for some in groups])[:, None]
-    sent = np.array([[name in some for name in trial.input_names] for some in groups])[:, None]
+    """Yield columns times the factor, and states from the zero, that fit the commands best.
 
-    def off(which: Array, by: Array) -> Array:
-        factor = by[:, None, None]
-        scaled = trial.states * np.where(columns[which], factor, 1.0)
-        return _off(policy, trial, scaled, trial.inputs * np.where(sent[which], factor, 1.0))
-
-    for start in (1.0, -1.0):
-        each = _solved(off, np.full(len(groups), start), 1e-4 * start)
-        for group, by in zip(groups, each, strict=True):
-            if not 1 / LARGEST < abs(by) < LARGEST or abs(by - 1) < ONE:
-                continue
-            by = -1.0 if abs(by + 1) < ONE else float(f"{by:.3g}")
-            if (group, round(float(np.log(abs(by))), 2), by > 0) not in tried:
-                yield Row(policy, log=MARGIN, names=group, by=by, fitted=True)
-
-
-def _solved(off: Callable[[Array, Array], Array], start: Array, small: float) -> list[float]:
-    """Minimise the residuals of B problems, over one number each, by Gauss-Newton.
-
-    Args:
-        off: returns the residuals (B, T, m) of the problems with given indices, at given numbers.
-        start: (B,) where to start.
-        small: the step of the finite differences.
-
-    Returns:
-        The numbers; NaN where the residuals don't depend on it.
+    A policy is linear in what it is fed: columns that are multiplied, and states that are off by d,
+    change a command by the gains times what is changed. Of one state, its sensor's zero may differ;
+    all may be off as a program passed them.
     """
-    by, left = np.array(start), np.arange(len(start))
-    for _ in range(ROUNDS):
-        if not len(left):
-            break
-        both = off(np.tile(left, 2), np.concatenate([by[left], by[left] + small]))
-        here = both[: len(left)]
-        slope = (both[len(left) :] - here) / small
-        size = (slope**2).sum(axis=(1, 2))
-        step = -(slope * here).sum(axis=(1, 2)) / np.where(size > 0, size, np.nan)
-        by[left] += step
-        left = left[np.isfinite(by[left]) & ~(np.abs(step) < 1e-6 * np.abs(by[left]))]
-    return [float(one) for one in by]
-
-
-def _off(policy: Policy, trial: Trial, states: Array, inputs: Array) -> Array:
-    """Return the logged commands minus the policy's, in units of the largest, (B, T, m).
-
-    Args:
-        policy: the policy.
-        trial: the trial, for the inputs held before it.
-        states: (B, T, n) its states, as they are assumed to have been.
-        inputs: (B or 1, T, m) its inputs likewise.
-    """
-    past = policy.past if trial.start_inputs is None else trial.start_inputs
-    asked = policy.commands(states[:, : trial.steps], past)
-    off: Array = (np.clip(inputs, policy.low, policy.high) - asked) / np.maximum(
-        np.abs(asked).max(axis=1, keepdims=True), 1e-12
-    )
-    return off
-
-
-def _origins(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
-    """Yield each state from another zero in the log, and all of them as a program passed them.
-
-    States that are off by d change a command by the gains times d; of one state, its sensor's zero
-    may differ.
-    """
-    policy, names = own.policy, model.state_names
-    if policy.gain is None:
+    policy, names = own.policy, (*model.state_names, *model.input_names)
+    free = replace(policy, low=np.full(model.m, -np.inf), high=np.full(model.m, np.inf))
+    run, n = commanded(free, trial), model.n
+    off, T = (run.sent - run.asked) / run.size, len(run.sent)
+    assert policy.gain is not None
+    gains = policy.gain[:T, :, :n] / run.size[:, None]
+    inside, asked = (
+        (u > policy.low) & (u < policy.high) for u in (run.sent, run.asked)
+    )  # at its limits a command tells nothing
+    log = [one for row in known for one in row.stories if one.kind is Kind.UNIT]
+    tried = {(one.names, round(float(np.log(abs(one.by))), 2), one.by > 0) for one in log}
+    for group in dict.fromkeys((*(one.names for one in log), tuple(logged))):
+        some = np.isin(names, group)
+        fed = np.einsum("tmn,tn->tm", gains, some[:n] * trial.states[:T])
+        slope = some[n:] * run.sent / run.size - fed
+        where = asked if some[n:].any() else inside
+        size = float((slope[where] ** 2).sum())
+        by = 1 - float((slope[where] * off[where]).sum()) / size if size else np.nan
+        if not 1 / LARGEST < abs(by) < LARGEST or abs(by - 1) < ONE:
+            continue
+        by = -1.0 if abs(by + 1) < ONE else float(f"{by:.3g}")
+        if (group, round(float(np.log(abs(by))), 2), by > 0) not in tried:
+            story = Story(Kind.UNIT, price=MARGIN, names=group, by=by)
+            yield Row(policy, multiplied(trial, group, by), (story,), fitted=True)
+    inside &= asked
+    rest, design = off[inside], gains[inside]
+    if inside.any(axis=1).sum() < STEPS_TO_JUDGE:
         return
-    run = commanded(policy, trial)
-    free = (run.sent > policy.low) & (run.sent < policy.high)
-    free &= (run.asked > policy.low) & (run.asked < policy.high)
-    if free.any(axis=1).sum() < STEPS_TO_JUDGE:
-        return
-    off = ((run.sent - run.asked) / run.size)[free]
-    gains = (policy.gain[: len(free), :, : model.n] / run.size[:, None])[free]
-    size = (gains**2).sum(axis=0)
-    each = gains.T @ off / np.where(size > 0, size, np.inf)
-    for i, name in enumerate(names):
+
+    def moved(by: Array) -> Trial:
+        return replace(trial, states=trial.states + by)
+
+    each = (design * rest[:, None]).sum(axis=0) / np.maximum((design**2).sum(axis=0), 1e-300)
+    for i, name in enumerate(names[:n]):
         by = float(f"{each[i]:.3g}")
         if name in logged and by:
             told = found("log.zero", name, ran=own.id, size="small" if by > 0 else "large", add=by)
             told = told.also(off=Quantity(abs(by), model.states[name]))
-            told = told.also(tables=(f"[log.state.{name}]",))
-            moved = by * (np.arange(model.n) == i)
-            yield Row(policy, log=MARGIN, names=(name,), off=moved, of_log=told, told=told)
-    joint = np.linalg.lstsq(gains, off, rcond=1e-6)[0]
-    does = np.abs(gains * joint).max(axis=0) > SLIGHT * np.abs(off).max(initial=1e-12)
+            told = told.also(tables=tables(model, [name]))
+            story = Story(Kind.LOG, told, price=MARGIN, names=(name,))
+            yield Row(policy, moved(by * (np.arange(n) == i)), (story,))
+    joint = np.linalg.lstsq(design, rest, rcond=1e-6)[0]
+    does = np.abs(design * joint).max(axis=0) > SLIGHT * np.abs(rest).max(initial=1e-12)
     if does.sum() >= 2:
         shares = zip(model.states.items(), joint, does, strict=True)
-        beside = tuple(f"{n} {with_unit(figure(x, 2), u)}" for (n, u), x, is_ in shares if is_)
-        told = found("run.origin", ran=own.id, off=beside)
-        yield Row(
-            policy, program=MARGIN * int(does.sum()), off=np.where(does, joint, 0.0), told=told
+        beside = tuple(
+            f"{name} {with_unit(figure(x, 2), u)}" for (name, u), x, is_ in shares if is_
         )
+        story = _passed("run.origin", own, MARGIN * int(does.sum()), off=beside)
+        yield Row(policy, moved(np.where(does, joint, 0.0)), (story,))
 
 
 def _smoothed(model: Model, own: Ran, trial: Trial) -> Iterator[Row]:
@@ -633,22 +546,23 @@ def _smoothed(model: Model, own: Ran, trial: Trial) -> Iterator[Row]:
 
     One filter serves all states, the velocities, or one of them.
     """
-    policy, names = own.policy, own.policy.state_names
-    if policy.gain is None:
-        return
-    T, rates = min(trial.steps, policy.horizon), velocities(model)
+    policy, names, T = own.policy, own.policy.state_names, min(trial.steps, own.policy.horizon)
+    past = policy.past if trial.start_inputs is None else trial.start_inputs
+    assert policy.gain is not None
     fed = np.abs(policy.gain[..., : len(names)]).max(axis=(0, 1)) > 0
     some = [name for name, is_ in zip(names, fed, strict=True) if is_]
-    moving = [name for name in some if name in rates]
+    moving = [name for name in some if name in velocities(model)]
     groups = [some, moving, [n for n in some if n not in moving], *([n] for n in some)]
-    smooth = filtered(trial.states[:T], SHARES)
+    smooth = filtered(trial.states, SHARES)
     for group in filter(None, dict.fromkeys(map(tuple, groups))):
-        passed = np.where(np.isin(names, group), smooth, trial.states[:T])
-        left = (_off(policy, trial.until(T), passed, trial.inputs[None, :T]) ** 2).mean(axis=(1, 2))
-        share = float(SHARES[int(np.argmin(left))])
+        passed = np.where(np.isin(names, group), smooth, trial.states)
+        asked = policy.commands(passed[:, :T], past)
+        size = np.maximum(np.abs(asked).max(axis=1, keepdims=True), 1e-12)
+        best = int(np.argmin((((trial.inputs[:T] - asked) / size) ** 2).mean(axis=(1, 2))))
+        share = float(SHARES[best])
         lag = Quantity(share / (1 - share) * trial.dt, "s")
-        told = found("run.smoothed", ran=own.id, states=group, share=share, lag=lag)
-        yield Row(policy, program=MARGIN, names=group, share=share, told=told)
+        story = _passed("run.smoothed", own, states=group, share=share, lag=lag)
+        yield Row(policy, replace(trial, states=passed[best]), (story,))
 
 
 def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
@@ -672,7 +586,8 @@ def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
     if cuts and not held.any():
         at = tuple(f"{n} = {number(v)}" for n, ends in cuts.items() for v in ends)
         told = found("run.clipped", *cuts, ran=own.id, share=float(cut.mean()), at=at)
-        yield Row(replace(policy, low=low, high=high), program=0.0, told=told)
+        story = Story(Kind.PROGRAM, told)
+        yield Row(replace(policy, low=low, high=high), trial, (story,))
 
 
 def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
@@ -681,7 +596,7 @@ def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
     end = float(u.max(initial=-np.inf))
     limit = float(policy.high[j] if sign > 0 else -policy.low[j])
     at, more = u >= end - FINE**2 * size, wanted > end + SLIGHT * size
-    enough = at.sum() >= max(STEPS_TO_JUDGE, CUT * len(u)) and end < limit - SLIGHT * size
+    enough = at.sum() >= max(STEPS_TO_JUDGE, 0.05 * len(u)) and end < limit - SLIGHT * size
     both = float((at & more).sum())
     return at if enough and both >= 0.8 * max(at.sum(), more.sum()) else None
 
@@ -706,16 +621,11 @@ def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:
     if not best:
         return
     late, price = policy.dt * best, MARGIN * (1 + best / policy.horizon)
-    clock = found("run.clock", ran=own.id, step=best, seconds=late)
-    begun = found("log.begun_late", ran=own.id, late=Quantity(late, "s"))
-    yield Row(
-        policy.after(best),
-        log=None if waits else price,
-        program=price if waits else None,
-        told=clock,
-        of_log=begun,
-        steps=best,
-    )
+    story = _passed("run.clock", own, price, step=best, seconds=late)
+    if not waits:
+        told = found("log.begun_late", ran=own.id, late=Quantity(late, "s"))
+        story = Story(Kind.LOG, told, price=price, rerun=True)
+    yield Row(policy.after(best), trial, (story,), best)
 
 
 # --- whose run it is ------------------------------------------------------------------------------
