@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Flag, auto
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
@@ -215,100 +215,65 @@ def accounts(
         plane: the heading, its rate (-1 if it is no state), and the speeds in m/s of a plane.
         inputs: commands of logs (T, m), whose largest suggest the unit of a part of 1.
     """
-    columns = _Columns(model, range(model.n) if shown is None else shown, related)
-    for group, terms in columns.groups().items():
-        yield from _units(columns.units, group, terms, model.n, inputs)
+    units, shown = (
+        [*model.states.values(), *model.inputs.values()],
+        range(model.n) if shown is None else shown,
+    )
+    sent, related = range(model.n, model.n + model.m), sorted(related)
+    exact = [r for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown}]
+    pairs = [(one.i, one.j) for one in exact]
+    alone = [(k,) for k in shown if not any(k in pair for pair in pairs)]
+
+    def of(some: Iterable[int], *wanted: str) -> tuple[int, ...]:
+        return tuple(k for k in some if units[k] in wanted)
+
+    def rows(*some: int) -> Term:
+        return ROWS if {*some} <= {*related} else Term(0)
+
+    # units: of one column, of one sensor, of all columns of a kind, of all commands of a unit
+    alike = [of(sent, units[k]) for k in sent]
+    stems = [(f"{stem}", f"{stem}/s") for stem in ("rad", "deg", "m")]
+    kinds = [of(shown, *kind) for both in stems for kind in (both, both[:1], both[1:])]
+    angles = of(shown, "rad")
+    groups = [*((k,) for k in (*shown, *sent)), *pairs, *kinds, *alike, angles + of(sent, "rad")]
+    # lengths scale with commands that are one
+    scaled = any(units[k].partition("/")[0] == "m" for k in sent)
+    for group in filter(None, dict.fromkeys(groups)):
+        fixed = scaled and any(units[k].startswith("m") for k in group)
+        motion = Term(0) if fixed or (group in pairs and group not in kinds) else MOTION
+        yield from _units(units, group, rows(*group) | motion | COMMANDS, model.n, inputs)
     for factor in (1e3, 1e-3):  # time stamps in ms, or taken for ms
         yield Account("pace", tuple(range(model.n)), factor, unit="ms", price=1.0, terms=ROWS)
-    yield from columns.signs()
-    yield from columns.exchanges()
-    if plane:  # headings from another zero, or counted the other way
+    # signs: of one column, of a position with its velocity, of commands
+    for k in shown:
+        price = 0.3 * (not units[k].endswith("/s"))
+        yield Account("sign", (k,), -1.0, price=price, terms=COMMANDS | rows(k))
+    for group in sorted((*pairs, *alone)):
+        yield Account("sign", group, -1.0, price=0.5, terms=MOTION | COMMANDS)
+    for group in dict.fromkeys((*((k,) for k in sent), *alike)):
+        yield Account("sign", group, -1.0, terms=COMMANDS)
+    # exchanges: of inputs (one perhaps of the other sign), joints, and any two columns
+    for a, b in combinations(sent, 2):
+        for turned in ((), (a,), (b,)):
+            price = 1.5 * len(turned)
+            yield Account("exchange", turned, -1.0, pairs=((a, b),), price=price, terms=MOTION)
+    for p, q in combinations(exact, 2):
+        if np.isclose(p.c, q.c):
+            both = ((p.i, q.i), (p.j, q.j))
+            yield Account("exchange", pairs=both, price=0.5, terms=MOTION)
+    for pair in combinations(shown, 2):
+        yield Account("exchange", pairs=(pair,), price=1.0, terms=MOTION | rows(*pair))
+    for k, j in product(related, sent):
+        yield Account("exchange", pairs=((k, j),), price=1.5, terms=ROWS)
+    if plane:  # headings from another zero, or counted the other way, as by a compass
         psi, rate, *speeds = plane
         yield Account("offset", (psi,), fitted=True, price=0.5, terms=ROWS)
-        yield Account("sign", (psi,), -1.0, price=0.5, fitted=True, terms=ROWS)  # a compass
+        yield Account("sign", (psi,), -1.0, price=0.5, fitted=True, terms=ROWS)
         if rate >= 0:
             yield Account("sign", (psi, rate), -1.0, price=0.5, terms=ROWS)
             yield Account("sign", (psi, rate), -1.0, price=1.0, fitted=True, terms=ROWS)
         if len(speeds) == 2:
             yield Account("axes", (psi, *speeds), price=0.5, terms=ROWS)
-
-
-class _Columns:
-    """The columns of a model by what one mistake may concern together.
-
-    Args:
-        model: with the units.
-        shown: indices of the states with a sensor.
-        related: those that kinematic rows relate.
-    """
-
-    def __init__(self, model: Model, shown: Sequence[int], related: Collection[int]) -> None:
-        self.units = [*model.states.values(), *model.inputs.values()]
-        self.shown, self.sent = shown, range(model.n, model.n + model.m)
-        self.related = sorted(related)
-        self.exact = [r for r in integrals(model) if r.exact and {r.i, r.j} <= {*shown}]
-        self.pairs = [(one.i, one.j) for one in self.exact]
-        self.alone = [(k,) for k in shown if not any(k in pair for pair in self.pairs)]
-
-    def of(self, some: Collection[int], *wanted: str) -> tuple[int, ...]:
-        """Return those of some columns that have one of these units."""
-        return tuple(k for k in some if self.units[k] in wanted)
-
-    def groups(self) -> dict[tuple[int, ...], Term]:
-        """Return the columns of one sensor, all of a kind, all commands of a unit, with terms."""
-        found, shown, sent = dict[tuple[int, ...], Term](), self.shown, self.sent
-
-        def add(terms: Term, *some: tuple[int, ...]) -> None:
-            for group in filter(None, some):
-                found[group] = found.get(group, Term(0)) | terms
-
-        add(COMMANDS, *((k,) for k in (*shown, *sent)), *self.pairs)
-        add(ROWS, *((k,) for k in self.related))
-        for stem in ("rad", "deg", "m"):
-            kinds = ((stem, f"{stem}/s"), (stem,), (f"{stem}/s",))
-            add(COMMANDS, *(self.of(shown, *kind) for kind in kinds))
-        turning, angles = self.of(shown, "rad", "rad/s"), self.of(shown, "rad")
-        add(MOTION, turning, angles, *((k,) for k in angles), angles + self.of(sent, "rad"))
-        add(MOTION, *(one for one in self.alone if one[0] in turning))
-        if not any(self.units[k].partition("/")[0] == "m" for k in sent):
-            lone = (one for one in self.alone if self.units[one[0]] == "m")
-            add(MOTION, self.of(shown, "m", "m/s"), *lone)
-        add(ROWS, *(one for u in ("m", "m/s") if len(one := self.of(self.related, u)) > 1))
-        add(MOTION | COMMANDS, *self.alike(), *((k,) for k in sent))
-        return found
-
-    def alike(self) -> list[tuple[int, ...]]:
-        """Return the commands of one unit, which are probably logged alike."""
-        return [self.of(self.sent, self.units[k]) for k in self.sent]
-
-    def signs(self) -> Iterator[Account]:
-        """Yield the other sign of one column, of a position with its velocity, of commands."""
-        for k in self.shown:
-            terms, place = COMMANDS | self._rows(k), not self.units[k].endswith("/s")
-            yield Account("sign", (k,), -1.0, price=0.3 * place, terms=terms)
-        for group in sorted((*self.pairs, *self.alone)):
-            yield Account("sign", group, -1.0, price=0.5, terms=MOTION | COMMANDS)
-        for group in dict.fromkeys((*((k,) for k in self.sent), *self.alike())):
-            yield Account("sign", group, -1.0, terms=COMMANDS)
-
-    def exchanges(self) -> Iterator[Account]:
-        """Yield inputs (one perhaps of the other sign), joints, and any two columns."""
-        for a, b in combinations(self.sent, 2):
-            yield Account("exchange", pairs=((a, b),), terms=MOTION)
-            for k in (a, b):
-                yield Account("exchange", (k,), -1.0, pairs=((a, b),), price=1.5, terms=MOTION)
-        for p, q in combinations(self.exact, 2):
-            if np.isclose(p.c, q.c):
-                pairs = ((p.i, q.i), (p.j, q.j))
-                yield Account("exchange", pairs=pairs, price=0.5, terms=MOTION)
-        for pair in combinations(self.shown, 2):
-            yield Account("exchange", pairs=(pair,), price=1.0, terms=MOTION | self._rows(*pair))
-        for k in self.related:
-            for j in self.sent:
-                yield Account("exchange", pairs=((k, j),), price=1.5, terms=ROWS)
-
-    def _rows(self, *some: int) -> Term:
-        return ROWS if {*some} <= {*self.related} else Term(0)
 
 
 def _units(
