@@ -40,13 +40,9 @@ from grounded.places import integrals
 from grounded.trial import Trial
 
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
-LEADS = (0.1, 0.3)  # [s] lead times of commands extrapolated by their slope
 STARTS = 120  # samples to predict from
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
 SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
-# times fewer moments and delays tell that no input acts in reverse: of 43 inputs that do, 2 times
-# fewer show 43, 3 times 42, 4 times 41, 6 times 26 (of 158 honest ones, none looks so)
-GLANCE = 2
 EVEN = 0.5  # of an input's effect: predictions that bend more are left out
 OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
 
@@ -114,14 +110,15 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
     trial = trial.until(trial.known_steps)
     reach = min(round(REACH_S / trial.dt), trial.steps // 4)
     least, every = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
-    if reach <= least or not np.isfinite(trial.inputs).all():
+    if reach <= least:
         return None
     seen = known_states(trial, shown)
     trial, known = _with_differences(model, trial, seen)
     ones, steps = np.ones(model.m), trial.steps - reach
 
-    def later(k: int, sent: Array = trial.inputs, delays: tuple[float, ...] = (0.0,)) -> Ahead:
-        moved = replace(trial, states=trial.states[: steps + 1], inputs=sent[k : k + steps])
+    def later(k: int, delays: tuple[float, ...] = (0.0,)) -> Ahead:
+        sent = trial.inputs[k : k + steps]
+        moved = replace(trial, states=trial.states[: steps + 1], inputs=sent)
         return Ahead(model, moved, known, STARTS, delays, linear=True)
 
     def as_told(ahead: Ahead) -> Fit:
@@ -130,7 +127,7 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         return free if near else ahead.best([ones], free=False)
 
     with np.errstate(all="ignore"):
-        logged = later(0, delays=(0.0, 0.05, 0.1, 0.2))
+        logged = later(0, DELAYS)
         if not logged.enough:
             return None
         # the shift that the model as it is likes best, then its neighbours, calibrated
@@ -145,11 +142,9 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         if fits[k].score > logged.still().score - MARGIN:
             return None  # the commands explain nothing
         # all that past and present commands can do
-        slope = np.diff(trial.inputs, axis=0, prepend=trial.inputs[:1]) / trial.dt
         before = min(
             logged.best([ones, 0.0 * ones]),
             logged.whatever_commands_do().best([ones]),
-            *(later(0, trial.inputs + lead * slope).best([ones]) for lead in LEADS),
             key=lambda fit: fit.score,
         )
     parts = fits[k].rms / before.rms
@@ -189,16 +184,13 @@ class Acts:
 UNKNOWN = Acts(0, float("nan"))
 
 
-def how_inputs_act(
-    model: Model, trial: Trial, shown: Sequence[int], *, fewer: int = 1
-) -> tuple[Acts, ...]:
+def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Acts, ...]:
     """Return how each input acts in a trial.
 
     Args:
         model: however crude, with the effects adopted.
         trial: of its states and inputs; only its part without gaps is used.
         shown: indices of the states with a sensor.
-        fewer: how many times fewer delays and moments to predict from are tried.
     """
     known = trial.until(max(trial.known_steps, 0))
     some = known_states(known, shown)
@@ -207,8 +199,7 @@ def how_inputs_act(
     found = list[tuple[Array, Array]]()
     with np.errstate(all="ignore"):
         for seconds in (HORIZONS[0], HORIZONS[-1]):
-            tried = STARTS // fewer, DELAYS[::fewer]
-            ahead = Ahead(model, known, some, *tried, linear=True, horizon=seconds)
+            ahead = Ahead(model, known, some, STARTS, DELAYS, linear=True, horizon=seconds)
             if ahead.enough:
                 found.append(_scores(ahead))
     return tuple(_acts([(nats[j], shares[j]) for nats, shares in found]) for j in range(model.m))
@@ -294,9 +285,6 @@ def judge_signs(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> 
     """
     if len(trials) < 2:
         return
-    glance = [how_inputs_act(model, trial, shown, fewer=GLANCE) for trial in trials]
-    if not any(one.share < 0 for every in glance for one in every):
-        return  # predictions are what takes time, above all of a simulator
     acts = [how_inputs_act(model, trial, shown) for trial in trials]
     for name, every in zip(model.input_names, zip(*acts, strict=True), strict=True):
         right, wrong = ([k for k, one in enumerate(every) if one.sign == s] for s in (1, -1))
