@@ -1,4 +1,4 @@
-"""Find a candidate's run in a log, and judge by its commands whether it is one.
+"""Whose run a log is by its commands, where it begins, and whether it fell.
 
 After a fall, or when its motors are cut, a robot's program sends other commands than the policy,
 mostly zeros, and the log contains them too. If the run had left [safety] by then, it counts as a
@@ -8,15 +8,12 @@ whole still resemble the candidate's.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, partial
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from grounded.accounts.returned import Suspicion, suspicion
 from grounded.accounts.sent import (
     DECISIVE,
     EXPLAINED,
@@ -29,19 +26,13 @@ from grounded.accounts.sent import (
     evidence,
     follows,
 )
-from grounded.findings import Finding, Quantity, Weight, found
+from grounded.findings import Finding, Quantity, found
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.wording import with_unit
 from grounded_trials.workspace.intake.opening.acted_on import ActedOn, acted_on
-from grounded_trials.workspace.intake.opening.foreign import cut_log
-from grounded_trials.workspace.intake.opening.reading import Read
 from grounded_trials.workspace.intake.opening.run_start import Recording, Start
-
-if TYPE_CHECKING:
-    from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 PUNCTUAL = 0.1  # of a step: by more, a first command with a stamp of its own is late
@@ -49,111 +40,7 @@ ONE = 3e-3  # rms difference, relative to size, below which two candidates count
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
-class Look:
-    """The search for a candidate's run in a log: where it begins, and whether it is its run.
-
-    Args:
-        read: the trial that would be stored.
-        log: the log in which its commands are judged; None if `read` was written by grounded.
-        own: the candidate.
-        candidates: candidates that may have been run instead.
-        task: the task of all candidates.
-    """
-
-    def __init__(
-        self,
-        read: Read,
-        log: ForeignLog | None,
-        own: Candidate,
-        candidates: list[Candidate],
-        task: Task,
-    ) -> None:
-        self.read, self.own, self.candidates, self.task = read, own, candidates, task
-        self.found: Start | None = None
-        self.exact = False
-        # set if judged on other samples than stored
-        self.apart = None if log is read.log else log
-        cut = self.apart.cut(read.trial.candidate)[0] if self.apart else read.trial
-        self.whole = interpolate_gaps(cut).trial
-        self.log = log.recording if log else None
-        seen = self._judged()
-        if read.bare and (alone := self._judged(others=())).why:
-            seen = alone  # it may be of another workspace: resembling one of these is coincidence
-        self.start_of: Callable[[Candidate], Start | None] = cache(partial(_start_of, self.log))
-        if self.log and read.log:
-            seen = self._located(self.log, read.log, seen)
-        elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
-            begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
-            given = Start(begins, 0.0, alike=True, opens_alike=True)
-            if sender_of(log.anywhere, own, [], lambda _: given).sure:
-                seen = replace(seen, why=None, other="")
-        judged = read.log is not None and not seen.other
-        self.fell = fall_in(task, own, self.read.trial, seen.ran) if judged else None
-        self.suspicion = seen
-
-    def _judged(self, others: Sequence[Candidate] | None = None) -> Suspicion:
-        """Return whose run the one that was cut seems to be by its commands."""
-        others = self.candidates if others is None else others
-        logged = self.log.measured if self.log else None
-        return suspicion(self.task, self.whole, self.own, others, logged)
-
-    def _located(self, log: Recording, stored: ForeignLog, seen: Suspicion) -> Suspicion:
-        """Cut the run where it begins in the log; return whose it is then."""
-        own, candidates, start_of = self.own, self.candidates, self.start_of
-        self.found = start = start_of(own)
-        sender = sender_of(log, own, candidates, start_of)
-        self.exact = sender.own is not None and sender.own.exact
-        behind = _behind(log, own.policy, start, sure=sender.sure)
-        if behind:
-            self.found, self.exact = behind, True
-            if abs(behind.seconds - log.first) > ALIGNED * log.interval:
-                self._cut(stored, behind)
-            seen = self._judged()
-        elif start and elsewhere(log, start, own.policy, why=bool(seen.why)):
-            self._cut(stored, start)
-            seen = self._judged()
-        guessed = {*log.names[0]} - {*log.measured}
-        if behind or sender.sure:
-            seen = replace(seen, why=None, other="")
-        elif sender.other:
-            seen = replace(seen, why=sender.why, other=sender.other)
-        elif start and guessed and seen.why and sender.own and sender.own.left < RESEMBLES:
-            # a program that differentiates positions has speeds that lag the estimated ones
-            self._cut(stored, start)
-            seen = replace(self._judged(), why=None, other="")
-        return seen
-
-    def _cut(self, stored: ForeignLog, start: Start) -> None:
-        """Cut the run from a log where it begins."""
-        ran, apart = self.own.id, self.apart
-        begins = start.seconds + (_sooner(apart, stored) if apart else 0)
-        kept = [one for one in self.read.findings if one.weight is Weight.NOTE]
-        cut_there = replace(cut_log(stored, ran, begins), before=self.read.before)
-        self.read = cut_there.telling(*kept)
-        if start.missed:
-            self.read = self.read.telling(self._not_sent(start.missed))
-        cut = apart.cut(ran, start.seconds)[0] if apart else self.read.trial
-        self.whole = interpolate_gaps(cut).trial
-
-    def _not_sent(self, missed: int) -> Finding:
-        """Return that the first steps of a run were not sent."""
-        pairs = zip(self.task.model.inputs.items(), self.task.past, strict=True)
-        held = tuple(with_unit(f"{name} = {value:g}", unit) for (name, unit), value in pairs)
-        return found("run.missed", ran=self.own.id, steps=missed, held=held)
-
-    @property
-    def doubt(self) -> tuple[bool, float]:
-        """Whether it is another's run, and how far the commands are from the candidate's."""
-        ran = self.suspicion.ran
-        return bool(self.suspicion.why), math.inf if ran is None else ran.error
-
-
-def _start_of(log: Recording | None, candidate: Candidate) -> Start | None:
-    """Return where a candidate's run seems to begin in a log."""
-    return log.start_of(candidate.policy) if log else None
-
-
-def _behind(log: Recording, policy: Policy, found: Start | None, *, sure: bool) -> Start | None:
+def behind(log: Recording, policy: Policy, found: Start | None, *, sure: bool) -> Start | None:
     """Return where a run begins whose commands are some steps late, or None.
 
     The same commands are exact that many steps later, on samples that were as old; but there the
@@ -179,8 +66,7 @@ def _behind(log: Recording, policy: Policy, found: Start | None, *, sure: bool) 
     return None
 
 
-@dataclass(frozen=True, eq=False)
-class Sender:
+class Sender(NamedTuple):
     """The candidate that sent the commands of a log, judged on the samples that it acted on."""
 
     own: ActedOn | None  # None if the log is too short
@@ -229,31 +115,21 @@ def sender_of(
         if (start is None or not start.alike) and (begun := start_of(one)) and begun.opens_alike:
             at = begun.seconds
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
-        if fit is None or fit.left > RESEMBLES or _differ(mine, fit) < ONE:
+        if fit is None or fit.left > RESEMBLES:
             continue
-        if (nats := evidence(mine.off, fit.off)) <= best:
+        T = min(len(mine.asked), len(fit.asked))
+        differ = np.sqrt((((mine.asked[:T] - fit.asked[:T]) / mine.size) ** 2).mean())
+        if differ < ONE or (nats := evidence(mine.off, fit.off)) <= best:
             continue
         if fit.exact or (not late and alike(one, at) is not None):
             best, name, theirs = nats, one.id, fit
-        if name and theirs.left < FINE:
+        if theirs.left < FINE:
             break
     if not name:
         return Sender(mine)
     told = found("log.another", ran=own.id, other=name, nats=best)
     told = told.also(theirs=max(theirs.left, FINE), mine=max(mine.left, FINE))
     return Sender(mine, told, name)
-
-
-def _differ(mine: ActedOn, fit: ActedOn) -> float:
-    """Return the rms difference of what two candidates send, relative to its size."""
-    T = min(len(mine.asked), len(fit.asked))
-    return float(np.sqrt((((mine.asked[:T] - fit.asked[:T]) / mine.size) ** 2).mean()))
-
-
-def _sooner(log: ForeignLog, stored: ForeignLog) -> float:
-    """Return by how much the first sample of the stored log is earlier [s]."""
-    assert log.recording is not None and stored.recording is not None
-    return (log.recording.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
 
 
 def elsewhere(log: Recording, start: Start, policy: Policy, *, why: bool) -> bool:
@@ -299,11 +175,10 @@ def fall_in(
     beyond = np.maximum(task.safety_low - states, states - task.safety_high)
     out = beyond.max(axis=1) > 0
     begin = max(0, ceased - STEPS_TO_JUDGE)
-    about = out[begin : ceased + STEPS_TO_JUDGE + 1]
-    if not about.any():
+    about = np.flatnonzero(out[begin : ceased + STEPS_TO_JUDGE + 1])
+    if not len(about):
         return None
-    first = begin + int(np.argmax(about))
-    inside = np.flatnonzero(~out[:first])
+    inside = np.flatnonzero(~out[: begin + about[0]])
     first = int(inside[-1]) + 1 if len(inside) else 0
     steps = min(first, ceased)
     if steps < STEPS_TO_JUDGE or steps + LAST >= task.horizon:

@@ -8,33 +8,39 @@ told, with its remedy. A user who names the candidate gets a warning instead.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.accounts.judge import contradicted
 from grounded.accounts.reported import scaled as scaled_columns
 from grounded.accounts.returned import (
     OTHERS,
     Kind,
     Story,
+    Suspicion,
     likeliest,
     of_full_scale,
     scored,
     stories,
+    suspicion,
     unit_by_factor,
 )
 from grounded.accounts.sent import FINE, RESEMBLES, follows, latest
+from grounded.accounts.table import Account
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
@@ -46,11 +52,17 @@ from grounded_trials.workspace.intake.opening.foreign import (
 )
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
-from grounded_trials.workspace.intake.recognising.look import Look
+from grounded_trials.workspace.intake.recognising.look import (
+    ALIGNED,
+    behind,
+    elsewhere,
+    fall_in,
+    sender_of,
+)
 from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
 
 if TYPE_CHECKING:
-    from grounded.accounts.table import Account
+    from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
@@ -93,30 +105,104 @@ class Case:
     Args:
         workspace: the workspace with the candidates.
         path: the log, for messages.
-        read: what it contains.
+        read: what it contains: the trial that would be stored.
         named: the candidate that the user named, if any.
+        log: the log in which its commands are judged; None if `read` was written by grounded.
     """
 
-    def __init__(self, workspace: Folder, path: Path, read: Read, named: str | None) -> None:
+    def __init__(
+        self, workspace: Folder, path: Path, read: Read, named: str | None, log: ForeignLog | None
+    ) -> None:
         self.workspace, self.path, self.named, self.task = workspace, path, named, workspace.task
-        self.ran, (self.own, _) = read.trial.candidate, workspace.candidate(read.trial.candidate)
+        self.read, self.ran = read, read.trial.candidate
+        self.own, _ = workspace.candidate(self.ran)
         candidates, self.earlier = _may_have_run(workspace)
-        logs = [read.log]
-        if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
-            logs.append(late)
-        rivals = [*self.earlier, *candidates]
-        looks = [Look(read, one, self.own, rivals, self.task) for one in logs]
-        look = self.look = min(looks, key=lambda one: one.doubt)
-        self.read, self.log, self.whole, self.seen = look.read, look.log, look.whole, look.suspicion
-        known = [] if read.bare else rivals  # resembling one of these may be coincidence
-        self.rival = next((one for one in known if one.id == self.seen.other), None)
-        self.again = NextCommand("ingest", (str(path) if self.read.log else "LOG",))
-        self.guessed = _guessed(self.log)
+        self.rivals, self.exact = [*self.earlier, *candidates], False
+        self.found: Start | None = None
+        # set if judged on other samples than stored
+        self.apart = None if log is read.log else log
+        cut = self.apart.cut(self.ran)[0] if self.apart else read.trial
+        self.whole = interpolate_gaps(cut).trial
+        self.log = log.recording if log else None
+        self.guessed = {*self.log.names[0]} - {*self.log.measured} if self.log else set[str]()
+        seen = self._judged(self.rivals)
+        if read.bare and (alone := self._judged(())).why:
+            seen = alone  # it may be of another workspace: resembling one of these is coincidence
+        if self.log and read.log:
+            seen = self._located(self.log, read.log, seen)
+        elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
+            begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
+            given = Start(begins, 0.0, alike=True, opens_alike=True)
+            if sender_of(log.anywhere, self.own, [], lambda _: given).sure:
+                seen = replace(seen, why=None, other="")
+        self.seen, judged = seen, read.log is not None and not seen.other
+        self.fell = fall_in(self.task, self.own, self.read.trial, seen.ran) if judged else None
+        known = [] if read.bare else self.rivals
+        self.rival = next((one for one in known if one.id == seen.other), None)
+        self.again = NextCommand("ingest", (str(path) if read.log else "LOG",))
+
+    @cached_property
+    def start_of(self) -> Callable[[Candidate], Start | None]:
+        """Where a candidate's run seems to begin in the log, if anywhere."""
+        log = self.log
+        return cache(lambda one: log.start_of(one.policy) if log else None)
+
+    def _judged(self, others: Sequence[Candidate]) -> Suspicion:
+        """Return whose run the one that was cut seems to be by its commands."""
+        logged = self.log.measured if self.log else None
+        return suspicion(self.task, self.whole, self.own, others, logged)
+
+    def _located(self, log: Recording, stored: ForeignLog, seen: Suspicion) -> Suspicion:
+        """Cut the run where it begins in the log; return whose it is then."""
+        self.found = start = self.start_of(self.own)
+        sender = sender_of(log, self.own, self.rivals, self.start_of)
+        self.exact = sender.own is not None and sender.own.exact
+        late = behind(log, self.own.policy, start, sure=sender.sure)
+        if late:
+            self.found, self.exact = late, True
+            if abs(late.seconds - log.first) > ALIGNED * log.interval:
+                self._cut(stored, late)
+            seen = self._judged(self.rivals)
+        elif start and elsewhere(log, start, self.own.policy, why=bool(seen.why)):
+            self._cut(stored, start)
+            seen = self._judged(self.rivals)
+        if late or sender.sure:
+            return replace(seen, why=None, other="")
+        if sender.other:
+            return replace(seen, why=sender.why, other=sender.other)
+        if start and self.guessed and seen.why and sender.own and sender.own.left < RESEMBLES:
+            # a program that differentiates positions has speeds that lag the estimated ones
+            self._cut(stored, start)
+            return replace(self._judged(self.rivals), why=None, other="")
+        return seen
+
+    def _cut(self, stored: ForeignLog, start: Start) -> None:
+        """Cut the run from a log where it begins; of another log, from its samples too."""
+        begins, kept = (
+            start.seconds,
+            [one for one in self.read.findings if one.weight is Weight.NOTE],
+        )
+        if self.apart and self.log and stored.recording:
+            begins += (self.log.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
+        self.read = replace(cut_log(stored, self.ran, begins), before=self.read.before)
+        self.read = self.read.telling(*kept)
+        if start.missed:
+            pairs = zip(self.task.model.inputs.items(), self.task.past, strict=True)
+            held = tuple(with_unit(f"{name} = {value:g}", unit) for (name, unit), value in pairs)
+            missed = found("run.missed", ran=self.ran, steps=start.missed, held=held)
+            self.read = self.read.telling(missed)
+        cut = self.apart.cut(self.ran, start.seconds)[0] if self.apart else self.read.trial
+        self.whole = interpolate_gaps(cut).trial
+
+    @property
+    def doubt(self) -> tuple[bool, float]:
+        """Whether it is another's run, and how far the commands are from the candidate's."""
+        return bool(self.seen.why), self.seen.ran.error if self.seen.ran else math.inf
 
     @property
     def opens(self) -> bool:
         """Whether at least the first commands are the candidate's, from the start found on."""
-        return bool(self.look.found and self.look.found.opens_alike)
+        return bool(self.found and self.found.opens_alike)
 
     @cached_property
     def as_logged(self) -> Story:
@@ -129,7 +215,7 @@ class Case:
             error = self.seen.ran.error if self.seen.ran else 1.0
             return scored(Kind.UNKNOWN, why, self.own, self.whole, error)
         kind = Kind.EARLIER if rival in self.earlier else kind
-        start = self.look.start_of(rival)
+        start = self.start_of(rival)
         run = log.trial_from(start.seconds) if log and start and start.alike else None
         fit = run and follows(rival.policy, run.until(rival.policy.horizon), 0)
         if run and fit:
@@ -139,7 +225,7 @@ class Case:
     @cached_property
     def columns(self) -> list[Finding]:
         """The faults of columns; none of them can be told without the commands."""
-        trial, fell = replace(self.read.trial, id=""), self.look.fell
+        trial, fell = replace(self.read.trial, id=""), self.fell
         known = trial.until(min(trial.known_steps, fell[0] if fell else trial.steps))
         untold = self.read.bare or self.silent
         return [] if untold else column_faults(self.workspace, known)
@@ -155,11 +241,11 @@ class Case:
 
     def warned(self) -> Read:
         """Return the trial with what is doubtful about where it begins, or about its samples."""
-        read, start, look = self.read, self.look.found, self.look
+        read, start = self.read, self.found
         if read.log and read.cut:  # states may be unknown when the run begins
             read.log.refuse_late(read.cut)
         if start and start.alike:
-            if start.loose_s > LOOSE * self.task.dt and not look.exact:
+            if start.loose_s > LOOSE * self.task.dt and not self.exact:
                 loose = Quantity(start.loose_s, "s")
                 read = read.telling(found("log.start_loose", ran=self.ran, loose=loose))
             if start.rival_s is not None:
@@ -188,8 +274,12 @@ def recognised(
     ran = read.trial.candidate
     if not ran or (is_stored(workspace, read.data) and not (read.log and not read.log.stored)):
         return read  # a log whose trial is set aside is examined again
-    case = Case(workspace, path, read, candidate)
-    read, fell = case.warned(), case.look.fell
+    logs = [read.log]
+    if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
+        logs.append(late)
+    cases = [Case(workspace, path, read, candidate, log) for log in logs]
+    case = min(cases, key=lambda one: one.doubt)
+    read, fell = case.warned(), case.fell
     stored = read.log.stored if read.log else ()
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell[0]) if fell and fell[0] in accepted else read
@@ -227,7 +317,7 @@ def _of_trial(case: Case) -> Iterator[Story]:
 
 def _of_log(case: Case) -> Iterator[Story]:
     """Yield the stories of a log whose commands are not its candidate's."""
-    log, task, own, fell = case.log, case.task, case.own, case.look.fell
+    log, task, own, fell = case.log, case.task, case.own, case.fell
     if case.rival:  # with the columns put back, the commands are those of the one that ran
         each = [
             one for ran in (own, case.rival) if log for one in stories_of_log(log, task, ran, None)
@@ -239,7 +329,7 @@ def _of_log(case: Case) -> Iterator[Story]:
         part = case.whole.until(fell[0])
         yield scored(Kind.FELL, fell[1], own, part, FINE * float(error), price=SHORTER)
     if log:
-        yield from stories_of_log(log, task, own, case.look.found)
+        yield from stories_of_log(log, task, own, case.found)
     if dead := [one for one in case.columns if one.code == "log.dead"]:
         yield replace(next(_of_columns(case, dead)), commands=-np.inf)
     earlier = None if case.read.bare else of_earlier_task(case.workspace, log, case.whole)
@@ -321,20 +411,17 @@ def _where(case: Case, story: Story) -> Story:
 
 def _in_unit(case: Case, story: Story) -> Story:
     """Return the story of columns times a factor: in the log, or sent so by the robot's program."""
-    names, by, model = (
-        tuple(n for n in story.names if n not in case.guessed),
-        story.by,
-        case.task.model,
-    )
-    facts: dict[str, Any] = {"ran": case.ran}
-    if shown := sent_otherwise(case.workspace, case.whole, names, by):
-        told = found("run.sends", *names, times=1 / by, **facts, **shown)
-        return replace(story, kind=Kind.LOG, finding=told, rerun=True)
+    names, by = tuple(n for n in story.names if n not in case.guessed), story.by
+    model, facts = case.task.model, {"ran": case.ran}
     unit = unit_by_factor(model, names, by) or of_full_scale(case.task, names, by)
+    if shown := _sent_otherwise(case, names, by, unit):
+        told = found("run.sends", *names, times=1 / by).also(**facts, **shown)
+        return replace(story, kind=Kind.LOG, finding=told, rerun=True)
+    told = scaled_columns(model, names, 1 / by, unit).also(**facts)
     if case.read.log is None:  # a program that writes trials
         units = {**model.states, **model.inputs}
-        facts |= {"tables": (), "writes": tuple(dict.fromkeys(units[name] for name in names))}
-    return replace(story, finding=scaled_columns(model, names, 1 / by, unit).also(**facts))
+        told = told.also(tables=(), writes=tuple(dict.fromkeys(units[name] for name in names)))
+    return replace(story, finding=told)
 
 
 def _exchanged(case: Case, story: Story) -> Story:
@@ -344,9 +431,6 @@ def _exchanged(case: Case, story: Story) -> Story:
     program passed them on to the motors in each other's place. (With both [log] and the wires
     exchanged a log looks the same, unless [log] read earlier trials well.)
     """
-    from grounded.accounts.judge import contradicted
-    from grounded.accounts.table import Account
-
     (a, b), model, run = story.names, case.task.model, case.whole
     every = (*model.state_names, *model.input_names)
     fault = Account("exchange", pairs=((every.index(a), every.index(b)),))
@@ -381,33 +465,13 @@ def _refusal(case: Case, story: Story) -> GroundedError:
     return GroundedError(told.also(log=path).weighing(Weight.REFUSE), then)
 
 
-def _of_earlier(workspace: Folder, path: str, ran: str) -> GroundedError:
-    """Return the error of a log that a candidate of an earlier task ran."""
-    was = other_task(workspace.task, workspace.candidate(ran)[0])
-    told = found("log.earlier", path, ran=ran, was=was)
-    return OfEarlierTask(told, NextCommand("ingest", (path, "--data")))
-
-
-def sent_otherwise(
-    workspace: Folder, trial: Trial, names: Sequence[str], by: float
-) -> dict[str, Any]:
+def _sent_otherwise(case: Case, names: Sequence[str], by: float, unit: str) -> dict[str, Any]:
     """Return what shows that a program sent inputs times a number, as the log says.
 
-    Another scale in the log would spoil every later one.
-
-    Args:
-        workspace: the workspace with the model and the earlier runs, read in the same way.
-        trial: the log, as it is read.
-        names: signals that have to be multiplied for the candidate's commands.
-        by: the number.
-
-    Returns:
-        Nothing if the log may have another unit, or nothing tells.
+    Another scale in the log would spoil every later one. Nothing is returned if the log may have
+    another unit, or nothing tells.
     """
-    from grounded.accounts.judge import contradicted
-    from grounded.accounts.table import Account
-
-    model, task = workspace.base_model, workspace.task
+    model, trial, runs = case.workspace.base_model, case.whole, case.workspace.task_trials
     if not {*names} <= {*model.input_names}:
         return {}
     if by == -1:
@@ -419,11 +483,11 @@ def sent_otherwise(
         )
         if as_logged:
             return {"moved": "as the log says"}
-        right = [] if mended else without(workspace, replace(trial, id=""), fault)
-        return {"proven": tuple(right)} if right else {}
-    unit = unit_by_factor(model, names, by) or of_full_scale(task, names, by)
-    runs = tuple(one.id for one in workspace.task_trials(measured=True) if one.candidate)
-    return {"proven": runs} if runs and not unit and by not in (1e-3, 1e3) else {}
+        right = () if mended else tuple(case.proven(fault))
+    else:
+        known_unit = unit or by in (1e-3, 1e3)
+        right = () if known_unit else tuple(t.id for t in runs(measured=True) if t.candidate)
+    return {"proven": right} if right else {}
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
@@ -444,11 +508,6 @@ def _lasting_s(log: Recording) -> float:
     """Return how long a log lasts after its first command [s]."""
     end = min(int(one.t.max()) for one in log.logged.values())
     return 1e-9 * (end - log.whole.origin_ns) - log.first
-
-
-def _guessed(log: Recording | None) -> set[str]:
-    """Return the states that [estimate] finds: no column holds them, so none is in another unit."""
-    return {*log.names[0]} - {*log.measured} if log else set()
 
 
 def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
@@ -487,6 +546,13 @@ def _like_task(policy: Policy, task: Task) -> bool:
 
 class OfEarlierTask(GroundedError):
     """Raised for a log that ran a candidate of an earlier task."""
+
+
+def _of_earlier(workspace: Folder, path: str, ran: str) -> OfEarlierTask:
+    """Return the error of a log that a candidate of an earlier task ran."""
+    was = other_task(workspace.task, workspace.candidate(ran)[0])
+    told = found("log.earlier", path, ran=ran, was=was)
+    return OfEarlierTask(told, NextCommand("ingest", (path, "--data")))
 
 
 def of_earlier_task(workspace: Folder, log: Recording | None, trial: Trial) -> Story | None:
