@@ -20,7 +20,8 @@ from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
 from grounded.accounts.finding import Finding, Preflight, UnusableTrials
 from grounded.accounts.judge import Verdict, judge
-from grounded.accounts.kinematics import gaps
+from grounded.accounts.kinematics import Gap, gaps
+from grounded.accounts.motion import HALF_ERROR
 from grounded.accounts.reported import keys, names_of, reported
 from grounded.accounts.signals import judge_inputs, judge_signal, signal_of
 from grounded.accounts.table import Told
@@ -32,7 +33,7 @@ from grounded.result import per_second
 from grounded.task import Task
 from grounded.trial import Trial
 
-GROSS, BAD = 0.7, 0.5  # unexplained share of a row's motion, and of it without a constant: reported
+GROSS = 0.7  # unexplained share of a row's motion that is reported
 ALIKE = 0.1  # relative tolerance within which several scales are one pace of the clock
 
 
@@ -82,7 +83,7 @@ def sound_trials(
         found += _unexplained(model, ages.trials, verdict, shown)
         found += [*judge_inputs(subject, ages.trials)]
         found += judge_time_step(model, ages.trials, ages.shown)
-        found = _by_the_clock(model, found, used, ages)
+        found = _by_the_clock(found, ages)
     judge_clocks(model, ages.trials, shown)
     for group in (ages.trials[:first], ages.trials[first:] if first else ()):
         judge_signs(model, group, shown)
@@ -148,35 +149,27 @@ def _unexplained(
     every = [gaps(model, trial, rows) for trial in trials]
     for row in rows:
         some = [one[row] for one in every if row in one]
-        if not some or np.median([gap.share for gap in some]) < GROSS:
-            continue
-        if np.median([gap.varying for gap in some]) < BAD:
+        gap = Gap(*np.median(some, axis=0)) if some else None
+        if gap is None or gap.share < GROSS or gap.varying < HALF_ERROR:
             continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
-        rate = float(np.median([gap.rate for gap in some]))
-        off = Quantity(rate, per_second(model.states[name]))
+        off = Quantity(float(gap.rate), per_second(model.states[name]))
         said = told_("sensor.mismatch", name, of=tuple(by), off=off)
         yield Finding(name, said, "mismatch", mend=said)
 
 
-def _by_the_clock(
-    model: Model, found: Sequence[Finding], trials: Sequence[Trial], ages: Ages
-) -> list[Finding]:
+def _by_the_clock(found: Sequence[Finding], ages: Ages) -> list[Finding]:
     """Replace several scale findings by one of the clock, if that explains them all.
 
     A clock that runs at half speed halves all derivatives, which looks like a scale of each sensor.
     """
     rates = [one for one in found if one.kind == "scale" and not one.corrected]
-    ratios = [one.scale for one in rates]
     contradicted = any(name.startswith("sensor_scale:") for name in ages.refuted)
-    if len(ratios) < 2 or contradicted:
-        return list(found)
-    pace = float(np.exp(np.mean(np.log(ratios))))
-    if max(abs(r / pace - 1) for r in ratios) > ALIKE or abs(pace - 1) < 2 * ALIKE:
+    pace = float(np.exp(np.mean([np.log(one.scale) for one in rates]))) if rates else 1.0
+    alike = all(abs(one.scale / pace - 1) < ALIKE for one in rates)
+    if len(rates) < 2 or contradicted or not alike or abs(pace - 1) < 2 * ALIKE:
         return list(found)
     names = [one.signal for one in rates]
     said = told_("log.pace", *names, by=1 / pace)
-    at = min(found.index(one) for one in rates)
-    rest = [one for one in found if one not in rates]
-    one = Finding("+".join(names), said, "scale", scale=pace, mend=said)
-    return [*rest[:at], one, *rest[at:]]
+    clock = Finding("+".join(names), said, "scale", scale=pace, mend=said)
+    return [clock if one is rates[0] else one for one in found if one not in rates[1:]]

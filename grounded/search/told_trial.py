@@ -72,7 +72,5 @@ def _odd_columns(model: Model, trial: Trial) -> Finding | None:
     except UnusableTrials as error:
         return error.findings[0]
     for one in in_the_log(looked.findings):
-        own = model.states[one.signal]
-        sign = one.kind == "sign"
-        return found("log.sign", one.signal) if sign else found("log.unit", one.signal, folded=own)
+        return scaled(model, [one.signal], one.scale, "" if one.kind == "sign" else "deg")
     return None

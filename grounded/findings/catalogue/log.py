@@ -19,13 +19,8 @@ ENTRIES: dict[str, Entry] = {
     # columns: the accounts
     "unit": Entry(
         "aside",
-        OF + "{about} {about:is/are} [[in {unit}, not {own}]][[in degrees, but was unwrapped in "
-        "{folded}]][[{times:.4g} times too {size}]]"
-        "[[ and of {negative}]][[: far beyond {beyond:.3g} in [safety] otherwise]]"
-        + MOTION
-        + RAN
-        + TIED
-        + IN,
+        OF + "{about} {about:is/are} [[in {unit}, not {own}]][[{times:.4g} times too {size}]]"
+        "[[ and of {negative}]]" + MOTION + RAN + TIED + IN,
         SCALE + WRITES + "[[, and in [limits] {limits}]]" + AGAIN,
         hides=(*RUN, "log.limits", "log.stated"),
     ),

@@ -24,8 +24,6 @@ from grounded_trials.workspace.where_to_mend import paths_of, read_by
 if TYPE_CHECKING:
     from grounded.accounts.table import Account, Told
 
-# multiples of [safety]: an angle beyond TURNS as radians, but inside WIDER as degrees, is suspect
-TURNS, WIDER = 5.0, 2.0
 COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
 KINDS = "unit sign compass exchange dead offset axes pace clock"
 COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
@@ -45,10 +43,7 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
             return ()
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
-    faults = column_faults(workspace, known)
-    if not any(one.code == "log.unit" for one in faults):
-        faults += _beyond_safety(workspace.task, trial)
-    faults += _clocks_apart(workspace, trial)
+    faults = [*column_faults(workspace, known), *_clocks_apart(workspace, trial)]
     return tuple(_mended(workspace, known, one, own=own) for one in faults)
 
 
@@ -152,23 +147,6 @@ def _as_sent(workspace: Folder, trial: Trial, fault: Account) -> bool:
     run = trial.until(policy.horizon)
     logged, mended = (follows(policy, one, late) for one in (run, fault.mended(run)))
     return logged is not None and logged.alike and not (mended is not None and mended.alike)
-
-
-def _beyond_safety(task: Task, trial: Trial) -> list[Finding]:
-    """Return faults for angles far beyond [safety] that would be inside if they were degrees."""
-    from grounded.accounts.reported import scaled
-    from grounded.accounts.table import DEGREES
-
-    assert task.safety_low is not None and task.safety_high is not None
-    allowed = np.maximum(np.abs(task.safety_low), np.abs(task.safety_high))
-    most = np.abs(np.where(np.isfinite(trial.states), trial.states, 0.0)).max(axis=0, initial=0.0)
-    odd = np.isfinite(allowed) & (most > TURNS * allowed) & (most <= DEGREES * WIDER * allowed)
-    units = list(task.model.states.items())
-    return [
-        scaled(task.model, [units[i][0]], DEGREES, "deg").also(beyond=float(allowed[i]))
-        for i in np.flatnonzero(odd)
-        if units[i][1] == "rad"
-    ]
 
 
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Finding]:
