@@ -13,7 +13,8 @@ from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
+from grounded_trials.workspace.readings import one_message
+from grounded_trials.workspace.where_to_mend import where_to_mend
 from workspaces import edit, make
 
 

@@ -33,17 +33,16 @@ from grounded_trials.workspace.adopted import in_order, installed_effects, plann
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     Since,
-    fitted_in_vain,
-    last_fit,
     made_from,
     newer_alone,
     read_diagnosis,
     since_diagnosis,
     usable_ids,
 )
+from grounded_trials.workspace.last_fit import fitted_in_vain, last_fit
 from grounded_trials.workspace.new_target import logged_target, to_plan
+from grounded_trials.workspace.readings import changed_since, in_time_now, last_again
 from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_in_model
-from grounded_trials.workspace.where_to_mend import changed_since, in_time_now, last_again
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 KEPT = "adoptions.json"  # in reports/

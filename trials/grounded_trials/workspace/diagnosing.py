@@ -14,7 +14,7 @@ from grounded.accounts.finding import in_the_log
 from grounded.accounts.kinematics import unheld
 from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import gain
+from grounded.diagnosis.error_report import gain, open_noise
 from grounded.diagnosis.excitation import SEPARABLE_NATS, probe
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
@@ -41,21 +41,21 @@ from grounded_trials.workspace.candidates.search_state import (
 )
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import (
-    chosen,
     diagnosable,
     made_from,
     model_print,
     write_diagnosis,
 )
+from grounded_trials.workspace.last_fit import chosen
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
     EXPORT,
     REPORT,
     after_diagnosis,
-    left_open,
 )
+from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
-from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
+from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding as Fault
@@ -181,10 +181,15 @@ def _with_next(
     write_diagnosis(workspace.reports, found)  # again, now with the next step
     then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
-    if then == EXPORT and left_open(found):
+    if then == EXPORT and _left_open(found):
         best = candidate_named(workspace, "best")
         found = found.asking(finding("gap.next.none", candidate=best), identity)
     return replace(found, then=then)
+
+
+def _left_open(found: Diagnosis) -> bool:
+    """Return whether a diagnosis leaves something that noise is not known to explain."""
+    return found.kind != "none" or bool(open_noise(found.prediction_error))
 
 
 def _not_compared(workspace: Folder) -> Iterator[Finding]:
@@ -235,7 +240,7 @@ def _in_vain(workspace: Folder, found: Diagnosis) -> Finding | None:
     names = [str(effect["name"]) for effect in workspace.config.model.effects]
     paid = gain(found.prediction_error, "outset", "crude") > 0
     claims = found.kind in ("effect", "several")
-    if not names or found.no_cause or claims or not left_open(found) or paid:
+    if not names or found.no_cause or claims or not _left_open(found) or paid:
         return None
     lost, model = 0, workspace.planner.fingerprint
     for tried in reversed(standing_in(workspace).history):

@@ -20,7 +20,7 @@ from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unknown_trial
 from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
-from grounded_trials.workspace.where_to_mend import again, read_otherwise
+from grounded_trials.workspace.readings import again, read_otherwise
 
 STATUS = NextCommand("status")
 

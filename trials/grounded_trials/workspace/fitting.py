@@ -25,11 +25,13 @@ from grounded_trials.workspace.adopted import settled
 from grounded_trials.workspace.adoption import not_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import chosen, ids_of, readable_diagnosis, write_fit
+from grounded_trials.workspace.last_diagnosis import readable_diagnosis
+from grounded_trials.workspace.last_fit import chosen, ids_of, write_fit
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
+from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
-from grounded_trials.workspace.where_to_mend import one_message, where_to_mend
+from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
     from grounded.accounts.finding import Finding as Fault

@@ -22,6 +22,7 @@ from grounded.checks import known, refused
 from grounded.errors import GroundedError
 from grounded.model import Model
 from grounded.search.candidate import Candidate
+from grounded.search.planner import Planner
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.plain_file import open_file, unreadable
@@ -45,7 +46,6 @@ from grounded_trials.workspace.user_files.model_file import load_module, model_i
 from grounded_trials.workspace.user_files.task_file import build_task, read_target
 
 if TYPE_CHECKING:
-    from grounded.search.planner import Planner
     from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.store.index import Index
 
@@ -135,8 +135,6 @@ class Folder:
     @cached_property
     def planner(self) -> Planner:
         """The task in which the search plans, with all adopted effects."""
-        from grounded.search.planner import Planner
-
         if not self.config.model.effects:
             return self._believed(Planner(self.task, self.task))
         from grounded_trials.workspace.adopted import planner_of

@@ -1,8 +1,8 @@
-"""The last diagnosis and fit of a workspace, in reports/, and the trials that the next can use.
+"""The last diagnosis of a workspace, in reports/, and the trials that the next can use.
 
 A diagnosis uses the stored trials up to the first missing input or unbounded number; gaps in single
-states stay gaps. A fit needs complete states. The files may come from another version or an
-untrusted source, so no text in them is trusted.
+states stay gaps. The file may come from another version or an untrusted source, so no text in it is
+trusted.
 
 `Since` describes what changed after a diagnosis: newer trials, adopted effects, other parameters. A
 verdict refers to the model and the trials of its time; effects adopted since are no longer missing.
@@ -10,9 +10,8 @@ verdict refers to the model and the trials of its time; effects adopted since ar
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,26 +19,19 @@ import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
-from grounded.result import Document
 from grounded.search.planner import model_fingerprint
-from grounded.share import Share, share_of
 from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import named_trials, sha256
-from grounded_trials.workspace.where_to_mend import changed_since
+from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.readings import changed_since
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis, Made
-    from grounded.fit import Fit
     from grounded.trial import Trial
 
-FILE, FIT = "diagnosis.json", "fit.json"  # in reports/
+FILE = "diagnosis.json"  # in reports/
 LEAST_STEPS = 2
-SAME = 1e-6  # relative tolerance for values that were written with eight digits
-
-
-# documents
 
 
 def write_diagnosis(folder: Path, found: Diagnosis) -> None:
@@ -70,53 +62,7 @@ def readable_diagnosis(folder: Path) -> Diagnosis | None:
         return None
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class LastFit(Document):
-    """What the last fit of all parameters was made from, and what it found."""
-
-    trials: tuple[str, ...] = ()
-    model: str = ""  # fingerprint
-    helps: bool = True  # whether it predicts better
-    known: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values with their std
-
-
-def write_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
-    """Write what a fit was made from, whether it predicts better, and its values with their std."""
-    known = {n: (e.value, e.std) for n, e in found.params.items() if math.isfinite(e.value + e.std)}
-    last = LastFit(ids_of(used), workspace.planner.fingerprint, found.helps, known)
-    write_document(made_folder(workspace.reports) / FIT, last.to_json())
-
-
-def last_fit(workspace: Folder) -> LastFit:
-    """Return the last fit of all parameters; an empty one without it, or if it can't be read."""
-    try:
-        return read_as(workspace.reports / FIT, LastFit) or LastFit()
-    except GroundedError:
-        return LastFit()
-
-
-def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
-    """Return whether the current model was already fitted to the same trials without a gain.
-
-    Args:
-        workspace: the workspace.
-        trials: short names; empty: all usable trials.
-    """
-    last = last_fit(workspace)
-    if last.helps or last.model != workspace.planner.fingerprint:
-        return False
-    try:
-        return last.trials == ids_of(chosen(workspace, trials).trials)
-    except GroundedError:  # then fit again
-        return False
-
-
 # trials
-
-
-def ids_of(trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the short names of trials."""
-    return tuple(trial.id for trial in trials)
 
 
 def diagnosable(workspace: Folder) -> list[Trial]:
@@ -138,30 +84,6 @@ def usable_ids(workspace: Folder) -> list[str]:
         GroundedError: if a stored file is damaged.
     """
     return [trial.id for trial in diagnosable(workspace)]
-
-
-def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
-    """Return the trials to fit or to diagnose, or a share of them.
-
-    States that were filled in by a smoother are no evidence: NaN again.
-
-    Args:
-        workspace: the workspace.
-        names: short names of the trials; empty: all usable ones.
-
-    Raises:
-        GroundedError: if there is none, or one of those named can't be used.
-    """
-    used = diagnosable(workspace)
-    names = named_trials(workspace, names, ids_of(used))
-    share = share_of([trial for trial in used if not names or trial.id in names])
-    guessed = {t.stored.id: t.meta.get("estimated", "").split(",") for t in workspace.trials()}
-    measured: list[Trial] = []
-    for trial in share.trials:
-        states = trial.states.copy()
-        states[:, [name in guessed[trial.id] for name in trial.state_names]] = math.nan
-        measured.append(replace(trial, states=states))
-    return replace(share, trials=measured)
 
 
 def left_out(workspace: Folder) -> list[Finding]:
@@ -261,11 +183,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
 
     # the effects of the model now, of those that it claims and of others
     missing = diagnosis.open(model.effects, model.params)
-    adopted = [
-        name
-        for name in diagnosis.effects
-        if name not in missing and not _other_value(diagnosis, name, model.params)
-    ]
+    adopted = [name for name in diagnosis.effects if name not in missing]
     known = {*made.effects, *diagnosis.effects}
     adopted += [name for e in model.effects if (name := str(e["name"])) not in known]
     same = [*map(dict, model.effects)] == [*map(dict, made.adopted)]
@@ -280,18 +198,6 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[st
         reread=changed_since(workspace, diagnosis, usable),
         further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
     )
-
-
-def _other_value(diagnosis: Diagnosis, name: str, params: Mapping[str, float]) -> bool:
-    """Return whether a claimed parameter differs from the claimed value: it was not adopted."""
-    family, _, own = name.partition(":")
-    row, was = diagnosis.ranked(name), made_from(diagnosis).nominal.get(own)
-    if family != "parameter" or own not in params or was is None or row is None:
-        return False
-    said = row.params["d"].moved(was)
-    low, high = said.interval or (said.value - 2 * said.std, said.value + 2 * said.std)
-    room = SAME * abs(said.value)
-    return not low - room <= params[own] <= high + room
 
 
 def newer_alone(diagnosis: Diagnosis) -> NextCommand:

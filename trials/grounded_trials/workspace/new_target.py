@@ -18,6 +18,7 @@ from grounded.task import MAX_HORIZON
 from grounded_trials.plain_file import unreadable
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import Config, set_target
 from grounded_trials.workspace.user_files.task_file import (
     check_tables,
@@ -101,8 +102,6 @@ def replace_target(
         GroundedError: if the columns are no target of the model, see `checked`; if grounded.toml
             has other errors; or if a file can't be written. The files are then as before.
     """
-    from grounded_trials.workspace.off_target import usual_weights
-
     columns = checked(columns, model)
     check_tables(config, model, len(next(iter(columns.values()))))
     each = usual_weights(model, columns)  # of ranges such as 1800 mm

@@ -237,27 +237,17 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
 
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
     """Return the command after a diagnosis: adopt claims, run another trial, or read the report."""
-    from grounded_trials.workspace.adoption import to_adopt
-
-    usable = usable_ids(workspace)
+    here = Situation(workspace, _standing_ahead(workspace), found, usable_ids(workspace))
     if not found.no_cause:
-        if (follow := to_adopt(workspace, found)) is not None:
-            return follow
+        if here.adopt is not None:
+            return here.adopt
         if found.probe:
             return to_run(workspace, found.probe, found.probe)
         settled = found.kind in ("none", "unknown") or found.contested  # nothing to adopt
         if not settled or not workspace.config.task.target:
             return REPORT
-        return next_command(workspace, _standing_ahead(workspace), found, usable)
-    here = Situation(workspace, _standing_ahead(workspace), found, usable)
+        return next_command(workspace, here.now, found, here.usable)
     return here.record if undrawn(workspace) else here.run
-
-
-def left_open(found: Diagnosis) -> bool:
-    """Return whether a diagnosis leaves something that noise is not known to explain."""
-    from grounded.diagnosis.error_report import open_noise
-
-    return found.kind != "none" or bool(open_noise(found.prediction_error))
 
 
 def _standing_ahead(workspace: Folder) -> Standing:

@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -24,20 +24,15 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.user_files.task_file import equal_weights
 
-if TYPE_CHECKING:
-    pass
-
 GROUPS_TOLD = 2  # groups of states reported: positions and angles before their rates, then by cost
 # a group with more than this share of the tracking cost is reported in any case
 COST_SHARE_TOLD = 0.5
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
-STEPS, STEPPED = 3, 0.3  # values that a sensor repeats, their share of its rows: it has steps
-NARROW = 0.25  # of the median gap of repeated values: one beside an interpolated value is smaller
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
-REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 # of the highest speed: below it a path's radius is not computed from its samples
 SPEED_OF_RADIUS = 0.5
+REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -130,13 +125,9 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
 
 
 def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
-    """Return the noise (std) of one sample of each of some states, (k,), rms over runs.
-
-    That of an encoder, which may rest on one count, is at least that of its counts.
-    """
+    """Return the noise (std) of one sample of each of some states, (k,), rms over runs."""
     each = [trial.noise(trial.finite_steps + 1) for trial in trials]
-    noise = np.sqrt(np.mean(np.square(each), axis=0))
-    return np.asarray(np.maximum(noise, _resolution(trials) / np.sqrt(12))[list(states)])
+    return np.asarray(np.sqrt(np.mean(np.square(each), axis=0))[list(states)])
 
 
 def std_at_end(ends: Sequence[Array], noise: Array) -> float:
@@ -262,20 +253,3 @@ def asked_for(task: Task) -> list[int]:
 def tracking_error(task: Task, trial: Trial) -> Array:
     """Return s_t - target_t, (T + 1, n), with angles wrapped; NaN where there is no target."""
     return task.model.difference(trial.states, task.target[: trial.steps + 1])
-
-
-def _resolution(trials: Sequence[Trial]) -> Array:
-    """Return the step between the values of each state's sensor, (n,); 0 if it shows no steps.
-
-    A sensor with steps, such as an encoder, repeats few values exactly, but for rows in between
-    that were interpolated.
-    """
-    states = np.concatenate([trial.states for trial in trials])
-    found = np.zeros(states.shape[1])
-    for i, column in enumerate(states.T):
-        values, times = np.unique(column[np.isfinite(column)], return_counts=True)
-        again = values[times > 1]
-        if len(again) >= STEPS and times[times > 1].sum() > STEPPED * len(column):
-            gaps = np.diff(again)
-            found[i] = gaps[gaps > NARROW * np.median(gaps)].min()
-    return found

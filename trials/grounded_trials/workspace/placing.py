@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import chain
 
 import numpy as np
 
@@ -18,13 +17,12 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.result import Document
 from grounded.search.candidate import Candidate
-from grounded.search.difference import student
 from grounded.search.starts import worth_of_start
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of
 
 FEWEST = 2  # runs from which a scatter is estimated
-UNLIKE = 0.975  # Student's t of a discarded run's start among the others: beyond, it is left out
+UNLIKE = 3.0  # times the others' rms: a discarded run that began farther off is left out
 TRIED = 20  # latest starts from which a candidate is predicted
 LATEST = 50  # runs that are looked at; the way of placing a robot may change
 
@@ -82,45 +80,21 @@ def placing(workspace: Folder, but: str = "") -> Placing:
         workspace: the workspace with the trials, also those that are set aside.
         but: id of a run that is left out, since it is judged by the others.
     """
-    n = workspace.base_model.n
-    runs = chain(
-        ((one, False) for one in workspace.trials()),
-        ((one, True) for one in workspace.aside_trials()),
-    )
-    found = sorted(
-        (
-            (one.stored.number, aside, off)
-            for one, aside in runs
-            for off in _off(workspace, one, but)
-        ),
-        key=lambda run: run[0],
-    )[-LATEST:]
-    off = np.array([run[2] for run in found]).reshape(len(found), n)
-    aside = np.array([run[1] for run in found], bool)
+    n, runs = workspace.base_model.n, [(one, False) for one in workspace.trials()]
+    runs += [(one, True) for one in workspace.aside_trials()]
+    runs.sort(key=lambda run: run[0].stored.number)
+    found = [(off, aside) for one, aside in runs for off in _off(workspace, one, but)][-LATEST:]
+    off = np.array([run[0] for run in found]).reshape(len(found), n)
+
+    # one that was discarded and began elsewhere, or was misread, says nothing about the others
     used = np.ones(off.shape, bool)
-    for k in np.flatnonzero(aside):
-        used[k] = _like(off, int(k))
+    for k in np.flatnonzero([aside for _, aside in found]):
+        others = np.delete(off, k, axis=0)
+        enough = len(others) >= FEWEST
+        used[k] = enough & (np.abs(off[k]) <= UNLIKE * np.sqrt((others**2).sum(0) / len(off)))
     columns = [off[used[:, i], i] for i in range(n)]
     rms = [float(np.sqrt((x**2).mean())) if len(x) >= FEWEST else np.nan for x in columns]
     return Placing(off[used.all(axis=1)], np.array(rms), np.array([len(x) for x in columns]))
-
-
-def _like(off: Array, k: int) -> Array:
-    """Return in which states a discarded run began as the others did, (n,) bool.
-
-    One that began elsewhere, or whose log was misread, says nothing about how exactly the others
-    are placed; nor can a single other run tell.
-    """
-    others = np.delete(off, k, axis=0)
-    count = len(others)
-    if count < FEWEST:
-        return np.zeros(off.shape[1], bool)
-    far = np.abs(off[k] - others.mean(axis=0))
-    error = others.std(axis=0, ddof=1) * (1 + 1 / count) ** 0.5
-    pairs = zip(far, error, strict=True)
-    return np.array(
-        [d <= e or student(d / e, count - 1) < UNLIKE if e else d == 0 for d, e in pairs]
-    )
 
 
 def _off(workspace: Folder, one: StoredTrial, but: str) -> Iterator[Array]:

@@ -39,7 +39,7 @@ from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import what_became
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
-from grounded_trials.workspace.where_to_mend import twice_in_time
+from grounded_trials.workspace.readings import twice_in_time
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Tried

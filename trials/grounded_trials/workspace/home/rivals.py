@@ -36,9 +36,9 @@ from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import value_of
 from grounded_trials.workspace.home.yaml_file import number_in, read_yaml
-from grounded_trials.workspace.last_diagnosis import chosen, ids_of
+from grounded_trials.workspace.last_fit import chosen, ids_of
+from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
-from grounded_trials.workspace.where_to_mend import one_message
 
 Effects = tuple[Mapping[str, Any], ...]
 

@@ -57,8 +57,9 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     refuse_known_data,
     set_aside_of,
 )
+from grounded_trials.workspace.readings import read_by, twice_in_time
 from grounded_trials.workspace.user_files.config import FILE
-from grounded_trials.workspace.where_to_mend import hashed, read_by, twice_in_time
+from grounded_trials.workspace.where_to_mend import hashed
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
 SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state

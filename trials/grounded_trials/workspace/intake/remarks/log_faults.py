@@ -19,7 +19,7 @@ from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.where_to_mend import paths_of, read_by
+from grounded_trials.workspace.readings import paths_of, read_by
 
 if TYPE_CHECKING:
     from grounded.accounts.table import Account, Told
