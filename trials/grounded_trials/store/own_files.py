@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -130,46 +130,46 @@ class OwnFile:
 
     def doubles(self, topic: str, names: list[str]) -> Array:
         """Return the numbers of a topic's messages, (N, len(names))."""
-        type, batches = self._topic(topic, names, listed=False)
-        fields = [(double_tag(type.by_name[name].number), 1) for name in names]
-        read = [uniform_doubles(b.buffer, b.starts, b.ends, fields) for b in batches]
-        blocks = [values for values in read if values is not None]
-        if len(blocks) < len(batches):  # laid out otherwise: it may take long
-            blocks = within(self.name, len(self.data), self._doubles, type, batches, names)
-        joined = [np.column_stack(values) for values in blocks]
-        return np.concatenate(joined or [np.zeros((0, len(names)))])
-
-    def _doubles(
-        self, type: Struct, batches: list[Messages], names: list[str]
-    ) -> list[list[Array]]:
-        return [[self._values(type, batch, name)[0] for name in names] for batch in batches]
+        return np.column_stack(self._read(topic, dict.fromkeys(names, 1), listed=False))
 
     def lists(self, topic: str, sizes: Mapping[str, int]) -> list[Array]:
         """Return the lists of a topic's messages, (N, size) each; (0, size) if all are empty."""
-        type, batches = self._topic(topic, sizes, listed=True)
-        all_there = [
-            (doubles_tag(type.by_name[name].number, size), size) for name, size in sizes.items()
-        ]
-        read = (uniform_doubles(b.buffer, b.starts, b.ends, all_there) for b in batches)
-        uniform = [values for values in read if values is not None]
-        if uniform and len(uniform) == len(batches):
-            return [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
-        return within(self.name, len(self.data), self._lists, topic, type, batches, sizes)
+        return self._read(topic, sizes, listed=True)
 
-    def _lists(
+    def _read(self, topic: str, sizes: Mapping[str, int], *, listed: bool) -> list[Array]:
+        """Return the numbers of some fields of a topic's messages, (N, size) each."""
+        if topic not in self.types:
+            raise unknown("channel", topic, self.types, self.name)
+        type, batches = self.types[topic], self.messages.get(topic, [])
+        for name in sizes:
+            kind = type.by_name[name].type if name in type.by_name else None
+            if not (kind == DOUBLES if listed else isinstance(kind, Number)):
+                what, where = "list" if listed else "number", f"{self.name}: {topic}"
+                raise unknown(what, name, type.by_name, where)
+        numbers = [(type.by_name[name].number, size) for name, size in sizes.items()]
+        tags = [(doubles_tag(n, size) if listed else double_tag(n), size) for n, size in numbers]
+        read = (uniform_doubles(b.buffer, b.starts, b.ends, tags) for b in batches)
+        uniform = [values for values in read if values is not None]
+        if not batches:
+            return [np.zeros((0, size)) for size in sizes.values()]
+        if len(uniform) == len(batches):
+            return [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
+        # laid out otherwise: it may take long
+        return within(self.name, len(self.data), self._fields, topic, type, batches, sizes)
+
+    def _fields(
         self, topic: str, type: Struct, batches: list[Messages], sizes: Mapping[str, int]
     ) -> list[Array]:
         found = []
         for name, size in sizes.items():
             parts = [self._values(type, batch, name) for batch in batches]
-            counts = np.concatenate([count for _, count in parts] or [np.zeros(0, int)])
+            counts = np.concatenate([count for _, count in parts])
             if counts.any() and (counts != size).any():
                 k = int(np.argmax(counts != size))
                 raise wrong(
                     f"{self.name}: {topic}[{k}].{name}", (int(counts[k]),), shape=f"({size},)"
                 )
-            values = np.concatenate([v for v, _ in parts] or [np.zeros(0)])
-            found.append(values.reshape(-1, size))
+            found.append(np.concatenate([v for v, _ in parts]).reshape(-1, size))
         return found
 
     def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
@@ -188,19 +188,6 @@ class OwnFile:
         k = int(np.argmax(off))
         facts = {"sample": str(k), "at": times[k], "expected": k * dt, "dt": dt, "robot": 1}
         raise refused("file.grid", f"{self.name}: {topic}", **facts)
-
-    def _topic(
-        self, topic: str, names: Iterable[str], *, listed: bool
-    ) -> tuple[Struct, list[Messages]]:
-        """Return a topic's messages and their type, after checking that it has these fields."""
-        if topic not in self.types:
-            raise unknown("channel", topic, self.types, self.name)
-        fields = self.types[topic].by_name
-        for name in names:
-            kind = fields[name].type if name in fields else None
-            if not (kind == DOUBLES if listed else isinstance(kind, Number)):
-                raise unknown("list" if listed else "number", name, fields, f"{self.name}: {topic}")
-        return self.types[topic], self.messages.get(topic, [])
 
     def _values(self, type: Struct, batch: Messages, name: str) -> tuple[Array, Counts]:
         """Return a field's numbers in a batch of messages, and their count in each message."""
