@@ -48,5 +48,4 @@ def _tell(done: SetAside) -> None:
             show(f"{name}: nothing was changed")
     for name, why in done.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
-    show(f"\nrun {done.run}, record a log, then" if done.run else "")
-    show(next_line(done.then))
+    show(f"\n{next_line(done.then)}")

@@ -34,7 +34,6 @@ class SetAside(Document):
     discarded: Mapping[str, str]  # t0004 -> why
     findings: tuple[Finding, ...] = ()
     then: NextCommand = field(metadata=UNSAID, default=STATUS)
-    run: str = field(metadata=UNSAID, default="")  # the candidate to run before `then`, if any
 
     def summary(self) -> str:
         """Return all trials that are set aside."""
@@ -78,8 +77,7 @@ def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
     done = set_aside(workspace, "discard", trials, why)
     with suppress(GroundedError):  # of files that are damaged: `status` names them
         if then := _instead(workspace, done.trials[-1]):
-            waits = standing_in(workspace).outstanding if then.verb == "next" else None
-            return replace(done, then=then, run=waits.id if waits else "")
+            return replace(done, then=then)
     return done
 
 

@@ -24,9 +24,9 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.user_files.task_file import equal_weights
 
-GROUPS_TOLD = 2  # groups of states reported: positions and angles before their rates, then by cost
-# a group with more than this share of the tracking cost is reported in any case
-COST_SHARE_TOLD = 0.5
+# groups of states reported beside the one that costs most: positions and angles before their
+# rates, then by cost
+GROUPS_TOLD = 2
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
@@ -93,11 +93,8 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     whole = [trial.whole(task.horizon) for trial in trials]
     errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
     ended = any(len(e) <= task.horizon for e in errors)
-    groups, arrives = weighed_groups(task), reaches(task)
-    units, rates = [task.model.states[names[0]] for names, _ in groups], rates_among(task, groups)
-    ranked: list[tuple[bool, float, int]] = []
-    errors_of: dict[int, OffTarget] = {}
-    for k, (names, what) in enumerate(groups):
+    found = dict[int, tuple[float, OffTarget]]()  # cost and errors of each group
+    for k, (names, what) in enumerate(weighed_groups(task)):
         states = [task.model.state_names.index(name) for name in names]
         each = [e[:, states] for e in errors]
         if not all(np.isfinite(e).all() for e in each) or not each:
@@ -112,16 +109,15 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             worst = max(far, key=lambda d: float(d.max()))
             values["rms"] = float(np.sqrt(np.mean(np.concatenate(far) ** 2)))
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
-        if (terminal.any() or arrives) and not ended:
+        if (terminal.any() or reaches(task)) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
             values["end_std"] = std_at_end([e[-1] for e in each], noise)
-        ranked.append((rates[k], -cost, k))
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
-        errors_of[k] = OffTarget(what.removeprefix("the "), units[k], **values, runs=len(each))
-    told = sorted(k for *_, k in sorted(ranked)[:GROUPS_TOLD])
-    dear = COST_SHARE_TOLD * sum(cost for _, cost, _ in ranked)
-    told += [k for _, cost, k in ranked if cost < dear and k not in told]
-    return tuple(errors_of[k] for k in told)
+        unit = task.model.states[names[0]]
+        found[k] = cost, OffTarget(what.removeprefix("the "), unit, **values, runs=len(each))
+    told = sorted(found, key=lambda k: (_is_rate(task, k), -found[k][0]))[:GROUPS_TOLD]
+    dear = max(found, key=lambda k: found[k][0], default=-1)
+    return tuple(one for k, (_, one) in found.items() if k in {*told, dear})
 
 
 def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
@@ -154,10 +150,10 @@ def by_runs(runs: int, *, each: bool = False) -> str:
     return told + " each" * each
 
 
-def rates_among(task: Task, groups: Sequence[tuple[Sequence[str], str]]) -> list[bool]:
-    """Return which of the groups are rates of others: they come after these."""
-    units = [task.model.states[names[0]] for names, _ in groups]
-    return [any(unit == f"{other}/s" for other in units) for unit in units]
+def _is_rate(task: Task, group: int) -> bool:
+    """Return whether a group of `weighed_groups` is the rate of another one."""
+    units = [task.model.states[names[0]] for names, _ in weighed_groups(task)]
+    return any(units[group] == f"{other}/s" for other in units)
 
 
 def reaches(task: Task) -> bool:

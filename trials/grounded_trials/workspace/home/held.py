@@ -21,14 +21,19 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from grounded.adapters.mujoco import MujocoStepper
+from grounded.adapters.mujoco_files import load
 from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
 from grounded.adapters.stepper import library
+from grounded.diagnosis.parts import Estimate
+from grounded.effects import param_name
+from grounded_trials.workspace.folder import Folder
 
+Lost = list[tuple[str, dict[str, Estimate]]]  # effects with their values
 Key = tuple[str, int, str]  # kind of element, its index in MjModel, field
 # relative change of a joint's inertia with the pose below which it is constant
 INERTIA_CONSTANT = 2e-3
@@ -87,16 +92,38 @@ class Held:
                 self.add(kind, index, field, value - setting.nominal, std)
         self.mj.mj_setConst(self.now, self.mj.MjData(self.now))
 
+    @classmethod
+    def of(cls, workspace: Folder, values: Mapping[str, Estimate]) -> tuple[Self, Lost]:
+        """Return what the file of a workspace's model holds now, and the effects that it can't.
+
+        Args:
+            workspace: the workspace, whose model is MuJoCo's.
+            values: of parameters and effects, with their +-, see `known_values`.
+        """
+        step, latency = workspace.base_model.step, workspace.config.task.latency
+        assert isinstance(step, MujocoStepper) and step.source is not None
+        own = {s.name: (values[s.name].value, values[s.name].std) for s in step.settings}
+        held = cls(step, load(step.source), own)
+        late = {
+            n: latency.get(n, 0.0) - step.latency.get(n, 0.0) for n in {**step.latency, **latency}
+        }
+        found = {f"delay:{n}": {"d": Estimate(d, 0.0, unit="s")} for n, d in late.items() if d}
+        pairs = [*found.items()]
+        for effect in workspace.config.model.effects:
+            name = str(effect["name"])
+            pairs.append((name, {q: values[param_name(name, q)] for q in effect if q != "name"}))
+        return held, [(name, c) for name, c in pairs if not held.adopt(name, c)]
+
     def add(self, kind: str, index: int, field: str, by: float, std: float) -> None:
         """Add to a number."""
         value, variance = self._delta.get((kind, index, field), (0.0, 0.0))
         self._delta[kind, index, field] = value + by, variance + std**2
 
-    def adopt(self, effect: str, c: Mapping[str, float], std: Mapping[str, float]) -> bool:
+    def adopt(self, effect: str, values: Mapping[str, Estimate]) -> bool:
         """Add an effect's values; return whether the format can hold it."""
         family, _, target = effect.partition(":")
-        rule = _RULES.get(family)
-        return rule is not None and rule(self, target, c, std)
+        rule, c = _RULES.get(family), {q: one.value for q, one in values.items()}
+        return rule is not None and rule(self, target, c, {q: e.std for q, e in values.items()})
 
     @property
     def numbers(self) -> tuple[Number, ...]:

@@ -18,14 +18,16 @@ import datetime
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from grounded import places
 from grounded.adapters.mujoco import MujocoStepper
-from grounded.adapters.mujoco_files import load
 from grounded.checks import unknown, wrong
 from grounded.diagnosis.parts import Estimate
 from grounded.effects import param_name
@@ -35,11 +37,11 @@ from grounded.findings import Finding
 from grounded.findings import found as finding
 from grounded.model import Model
 from grounded.result import Document
+from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.adoption import known_values, units_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held
-from grounded_trials.workspace.home.yaml_file import as_yaml, number_in, read_yaml
 from grounded_trials.workspace.last_diagnosis import usable_ids
 from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
 
@@ -56,6 +58,7 @@ KEYS = {
     "play": ("backlash", "b"),
     "rate_limit": ("rate_limit", "r"),
 }
+LARGEST = 2**20  # [bytes] of a YAML file
 DRIVES = ("joint_friction", "load_friction", "added_inertia")  # with the speed that it drives
 HELD = {"frictionloss": "dry_friction", "damping": "viscous_friction", "armature": "inertia"}
 RATES = {"coulomb_friction": ("c", "dry_friction"), "viscous_friction": ("k", "viscous_friction")}
@@ -217,14 +220,7 @@ def _of_file(
     workspace: Folder, known: Mapping[str, Estimate], name: str, drives: str
 ) -> Iterator[tuple[str, Estimate]]:
     """Yield the changed numbers of an actuator's joint in an MJCF, in the unit of its command."""
-    step = workspace.base_model.step
-    assert isinstance(step, MujocoStepper) and step.source is not None
-    own = {s.name: (known[s.name].value, known[s.name].std) for s in step.settings}
-    held = Held(step, load(step.source), own)
-    for effect in workspace.config.model.effects:
-        text = str(effect["name"])
-        c = {q: known[param_name(text, q)] for q in effect if q != "name"}
-        held.adopt(text, {q: e.value for q, e in c.items()}, {q: e.std for q, e in c.items()})
+    held, _ = Held.of(workspace, known)
     dof, push = held.dof(drives) if drives else -1, held.push(name)
     for one in held.numbers if dof >= 0 and push else ():
         if one.kind == "joint" and one.index == held.file.dof_jntid[dof] and one.field in HELD:
@@ -240,3 +236,45 @@ def _gain(model: Model, name: str, drives: str) -> float:
     _, f_u = model.system.linearise(x, u, model.values, dt)
     by = f_u[0, model.state_names.index(drives), model.input_names.index(name)]
     return float(np.asarray(by)) / dt
+
+
+# small YAML files: plain tables, lists, texts and numbers, nothing executable
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Return the table that a YAML file holds.
+
+    Raises:
+        GroundedError: if it can't be read, or holds something else.
+    """
+    try:
+        with open_file(path) as stream:
+            text = stream.read(LARGEST).decode("utf-8")
+        table = YAML(typ="safe", pure=True).load(text)
+    except (OSError, UnicodeDecodeError, YAMLError, RecursionError, ValueError) as error:
+        raise unreadable(path, str(error), kind="YAML file") from None
+    if not isinstance(table, dict):
+        raise wrong(path.name, must="dict")
+    return {str(key): value for key, value in table.items()}
+
+
+def as_yaml(table: Mapping[str, Any]) -> bytes:
+    """Return a table as YAML, innermost tables on one line."""
+    yaml: Any = YAML(typ="safe", pure=True)
+    stream = StringIO()
+    yaml.default_flow_style, yaml.width, yaml.sort_base_mapping_type_on_output = None, 1000, False
+    yaml.dump(dict(table), stream)
+    return stream.getvalue().encode()
+
+
+def number_in(path: Path, key: str, value: Any) -> tuple[float, float]:
+    """Return a value and its standard deviation (NaN if not given): a number, or a table of both.
+
+    Raises:
+        GroundedError: if it is something else.
+    """
+    table = value if isinstance(value, Mapping) else {"value": value}
+    numbers: list[Any] = [table.get("value"), table.get("std", float("nan"))]
+    if not all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers):
+        raise wrong(key, value, must="number", where=path.name)
+    return float(numbers[0]), float(numbers[1])

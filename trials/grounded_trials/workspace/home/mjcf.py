@@ -17,7 +17,12 @@ import numpy as np
 
 from grounded.adapters.mujoco_names import FIELDS
 from grounded_trials.workspace.home.held import Number
-from grounded_trials.workspace.home.xml_text import Element, XmlText
+from grounded_trials.workspace.home.xml_text import (
+    Element,
+    XmlText,
+    first_child,
+    set_or_remove,
+)
 
 VECTORS = {"gear": "actuator_gear", "friction": "geom_friction"}  # written as a whole if new
 # shortcuts that `general` can replace, and what each says in attributes of its own
@@ -72,11 +77,11 @@ class Mjcf:
             first = model.body_jntadr if kind == "joint" else model.body_geomadr
             name = getattr(model, kind)(index).name
             index -= int(first[body])
-        named = [one for one in found if name and one.get("name") == name]
+        named = [one for one in found if name and one.get("name", "") == name]
         if named:
             return named[0]
         one = found[index] if 0 <= index < len(found) else None
-        return None if one is None or one.get("name") != name else one
+        return None if one is None or one.get("name", "") != name else one
 
     def write(self, numbers: Sequence[Number]) -> list[Number]:
         """Write numbers into the text; return those that have no place in it."""
@@ -94,9 +99,8 @@ class Mjcf:
             there = to.with_name(f"{to.stem}-{path.name}")
             found[there] = text.written()
             include = self._includes[path]
-            include.text.set(include, "file", there.name)
-        self.main.insert(self.main.root.begin, comment)
-        return {to: self.main.written(), **found}
+            include.set("file", there.name)
+        return {to: self.main.written(comment), **found}
 
     def _read(self, path: Path) -> XmlText:
         self.texts[path] = XmlText(path.read_bytes(), str(path))
@@ -104,9 +108,9 @@ class Mjcf:
 
     def _inside(self, element: Element) -> Iterator[Element]:
         """Yield what is directly in an element, also by an include or in a frame."""
-        for one in element.children:
+        for one in element:
             if one.tag == "include":
-                path = (self.path.parent / one.get("file")).resolve()
+                path = (self.path.parent / one.get("file", "")).resolve()
                 if path not in self.texts:
                     self._includes[path] = one
                     self._read(path)
@@ -139,19 +143,18 @@ class Mjcf:
 
     def _first(self, element: Element, name: str, value: float, index: int) -> None:
         """Set the first number of an attribute."""
-        rest = element.get(name).split()[1:]
+        rest = element.get(name, "").split()[1:]
         if not element.get(name) and name in VECTORS:
             rest = [f"{one:.12g}" for one in getattr(self.compiled, VECTORS[name])[index, 1:]]
-        element.text.set(element, name, " ".join([f"{value:.8g}", *rest]))
+        element.set(name, " ".join([f"{value:.8g}", *rest]))
 
     def _degrees(self) -> bool:
-        stated = [one.get("angle") for one in self.main.root.below() if one.tag == "compiler"]
+        stated = [one.get("angle") for one in self.main.root.iter("compiler")]
         return "radian" not in stated
 
     def _mass(self, element: Element, number: Number) -> bool:
         """Scale the mass and the inertia of a body."""
         factor = number.value / number.was if number.was else 0.0  # a payload is a point
-        text = element.text
         inertial = next((one for one in self._inside(element) if one.tag == "inertial"), None)
         if inertial is None:
             model, i = self.compiled, number.index
@@ -161,66 +164,66 @@ class Mjcf:
                 "mass": [number.value],
                 "diaginertia": np.maximum(model.body_inertia[i] * factor, POINT),
             }
-            inertial = text.child(element, "inertial")
+            inertial = first_child(element, "inertial")
             for name, each in row.items():
-                text.set(inertial, name, " ".join(f"{x:.10g}" for x in each))
+                inertial.set(name, " ".join(f"{x:.10g}" for x in each))
             return True
-        text.set(inertial, "mass", f"{number.value:.8g}")
+        inertial.set("mass", f"{number.value:.8g}")
         for name in ("diaginertia", "fullinertia"):
             if given := inertial.get(name):
                 scaled = np.array(given.split(), float) * factor
-                text.set(inertial, name, " ".join(f"{x:.10g}" for x in scaled))
+                inertial.set(name, " ".join(f"{x:.10g}" for x in scaled))
         return True
 
     def _actuator(self, element: Element, number: Number) -> bool:
-        text, field, value = element.text, number.field, number.value
+        field, value = number.field, number.value
         if field == "delay":
             samples = math.ceil(value / self.compiled.opt.timestep - 1e-9) + 1
             for name, new in (("delay", f"{value:.8g}"), ("nsample", f"{samples}")):
-                text.set(element, name, new)
-            text.set(element, "interp", "linear")
+                element.set(name, new)
+            element.set("interp", "linear")
             return True
         if field == "gear":
             self._first(element, "gear", value, number.index)
             return True
         if own := OWN.get((element.tag, field)):
-            text.set(element, own, f"{value:.8g}")
+            element.set(own, f"{value:.8g}")
             return True
         return self._general(element, number)
 
     def _general(self, element: Element, number: Number) -> bool:
         """Write a gain, a lag or a fed-back gain as the attributes of a `general` actuator."""
-        model, i, text = self.compiled, number.index, element.text
+        model, i = self.compiled, number.index
         kinds = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
         if element.tag not in SHORTCUTS or max(kinds[:2]) > 1 or int(kinds[2]) not in LAGS:
             return False
         if element.tag != "general":
             for name in SHORTCUTS[element.tag]:
-                text.set(element, name, None)
+                set_or_remove(element, name, None)
             self._typed(element, i)
-            text.rename(element, "general")
+            element.tag = "general"
         if number.field == "lag":
-            text.set(element, "dyntype", "filterexact")
-            text.set(element, "dynprm", f"{number.value:.8g}")
+            element.set("dyntype", "filterexact")
+            element.set("dynprm", f"{number.value:.8g}")
             return True
         for array, column, factor in FIELDS[number.field].places:
             name = array.removeprefix("actuator_")
-            given = element.get(name).split() or _trimmed(getattr(model, array)[i])
+            given = element.get(name, "").split() or _trimmed(getattr(model, array)[i])
             given += ["0"] * (int(column or 0) + 1 - len(given))
             given[int(column or 0)] = f"{factor * number.value:.8g}"
-            text.set(element, name, " ".join(given))
+            element.set(name, " ".join(given))
         return True
 
     def _typed(self, element: Element, i: int) -> None:
         """Say in a `general` element what its shortcut said."""
-        model, text = self.compiled, element.text
-        text.set(element, "gaintype", GAINS[model.actuator_gaintype[i]])
-        text.set(element, "gainprm", " ".join(_trimmed(model.actuator_gainprm[i])))
-        text.set(element, "biastype", BIASES[model.actuator_biastype[i]])
-        text.set(element, "biasprm", " ".join(_trimmed(model.actuator_biasprm[i])))
+        model = self.compiled
+        element.set("gaintype", GAINS[model.actuator_gaintype[i]])
+        element.set("gainprm", " ".join(_trimmed(model.actuator_gainprm[i])))
+        element.set("biastype", BIASES[model.actuator_biastype[i]])
+        element.set("biasprm", " ".join(_trimmed(model.actuator_biasprm[i])))
         if model.actuator_dyntype[i]:
-            text.set(element, "dyntype", LAGS[int(model.actuator_dyntype[i])])
-            text.set(element, "dynprm", " ".join(_trimmed(model.actuator_dynprm[i])))
+            element.set("dyntype", LAGS[int(model.actuator_dyntype[i])])
+            element.set("dynprm", " ".join(_trimmed(model.actuator_dynprm[i])))
 
 
 def _trimmed(values: Any) -> list[str]:
@@ -244,8 +247,7 @@ class Urdf:
 
     def files(self, to: Path, comment: str) -> Mapping[Path, bytes]:
         """Return the contents of the file to write."""
-        self.text.insert(self.text.root.begin, comment)
-        return {to: self.text.written()}
+        return {to: self.text.written(comment)}
 
     def _write(self, number: Number) -> bool:
         name, _, field = number.name.rpartition(".")
@@ -254,26 +256,23 @@ class Urdf:
         joint, attribute = self._named("joint", name), DYNAMICS.get(field)
         if joint is None or attribute is None:
             return False
-        dynamics = joint.first("dynamics")
+        dynamics = joint.find("dynamics")
         if dynamics is None:
-            dynamics = self.text.child(joint, "dynamics")
-        self.text.set(dynamics, attribute, f"{number.value:.8g}")
+            dynamics = first_child(joint, "dynamics")
+        dynamics.set(attribute, f"{number.value:.8g}")
         return True
 
     def _named(self, tag: str, name: str) -> Element | None:
-        found = (one for one in self.text.root.children if one.tag == tag)
-        return next((one for one in found if one.get("name") == name), None)
+        return next((e for e in self.text.root.findall(tag) if e.get("name") == name), None)
 
     def _mass(self, link: Element | None, number: Number) -> bool:
         """Scale the mass and the inertia of a link."""
-        inertial = link and link.first("inertial")
-        mass = inertial and inertial.first("mass")
-        if not (inertial and mass):
+        mass = None if link is None else link.find("inertial/mass")
+        if link is None or mass is None:
             return False
         factor = number.value / number.was if number.was else 1.0
-        self.text.set(mass, "value", f"{number.value:.8g}")
-        inertia = inertial.first("inertia")
-        for name, given in list(inertia.attributes.items()) if inertia else ():
-            assert inertia is not None
-            self.text.set(inertia, name, f"{float(given) * factor:.10g}")
+        mass.set("value", f"{number.value:.8g}")
+        inertia = link.find("inertial/inertia")
+        if inertia is not None:
+            inertia.attrib = {n: f"{float(v) * factor:.10g}" for n, v in inertia.items()}
         return True

@@ -35,7 +35,7 @@ from grounded_trials.plain_file import unreadable
 from grounded_trials.workspace.adopted import planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import value_of
-from grounded_trials.workspace.home.yaml_file import number_in, read_yaml
+from grounded_trials.workspace.home.library import number_in, read_yaml
 from grounded_trials.workspace.last_fit import chosen, ids_of
 from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.user_files.model_file import load_module, model_in

@@ -15,7 +15,6 @@ import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from grounded.adapters.mujoco import MujocoStepper
 from grounded.adapters.mujoco_files import files_of, load
@@ -94,14 +93,11 @@ def export_model(workspace: Folder, path: str | Path | None = None) -> TakenHome
 
 def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
     """Write an MJCF or URDF file."""
-    model, file, values = workspace.base_model, load(source), known_values(workspace)
-    assert isinstance(model.step, MujocoStepper)
-    own = {s.name: (values[s.name].value, values[s.name].std) for s in model.step.settings}
-    held = Held(model.step, file, own)
-    lost = list(_adopted(workspace, held, values))
+    held, open_ = Held.of(workspace, known_values(workspace))
+    lost = [_not_held(name, c) for name, c in open_]
     dropped = list[Number]()
     for _ in range(2):  # again without what the written file does not compile to
-        form = Urdf(source) if _is_urdf(source) else Mjcf(source, file)
+        form = Urdf(source) if _is_urdf(source) else Mjcf(source, held.file)
         numbers = held.without(dropped)
         dropped += form.write(numbers)
         numbers = held.without(dropped)
@@ -119,21 +115,6 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
         told += [finding("model.reads", *sorted(beside))] if beside else []
     others = tuple(name for name in files if name != path)
     return TakenHome(path, source, date, taken, settle(told), others)
-
-
-def _adopted(workspace: Folder, held: Held, values: Mapping[str, Estimate]) -> Any:
-    """Add latencies and adopted effects to what a file holds; yield those that it can't."""
-    own, latency = held.stepper.latency, workspace.config.task.latency
-    for name in {**own, **latency}:
-        late = latency.get(name, 0.0) - own.get(name, 0.0)
-        if late and not held.adopt(f"delay:{name}", {"d": late}, {"d": 0.0}):
-            yield _not_held(f"delay:{name}", {"d": Estimate(late, unit="s")})
-    for effect in workspace.config.model.effects:
-        name = str(effect["name"])
-        c = {q: values[param_name(name, q)] for q in effect if q != "name"}
-        known = {q: one.value for q, one in c.items()}
-        if not held.adopt(name, known, {q: one.std for q, one in c.items()}):
-            yield _not_held(name, c)
 
 
 def _not_held(effect: str, c: Mapping[str, Estimate]) -> Finding:

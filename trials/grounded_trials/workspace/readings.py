@@ -1,0 +1,215 @@
+"""How [log] reads the signals, and how it read those of the trials.
+
+The metadata of each trial records the keys of [log] by which its signals were read. A trial keeps
+its numbers when [log] is changed: what a diagnosis found in it may be due to what was corrected
+there since (`changed_since`), and its log has to be ingested again first.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from grounded.accounts.finding import SENSOR_DELAY, Finding, late_effects
+from grounded.errors import NextCommand
+from grounded.findings import Finding as Said
+from grounded.findings import found as said
+from grounded.places import heading, position
+from grounded_trials.workspace.identity import READ_BY, StoredTrial
+
+if TYPE_CHECKING:
+    from grounded.diagnosis.parts import Diagnosis
+    from grounded_trials.logs.log_table import LogMapping
+    from grounded_trials.workspace.folder import Folder
+
+
+@dataclass(frozen=True)
+class Reading:
+    """How [log] reads a signal: its column, and the numbers that correct it."""
+
+    path: str = ""
+    scale: float = 1.0
+    offset: float = 0.0
+    delay_s: float = 0.0
+
+
+NUMBERS = ("scale", "offset", "delay_s")
+UNCHANGED = Reading()
+
+
+def readings(mapping: LogMapping | None) -> dict[str, Reading]:
+    """Return how [log] reads each signal; {} without [log]."""
+    found = {**mapping.states, **mapping.inputs} if mapping else {}
+    return {
+        name: Reading(spec.path, *(float(getattr(spec, key)) for key in NUMBERS))
+        for name, spec in found.items()
+    }
+
+
+def read_by(mapping: LogMapping) -> dict[str, str]:
+    """Return the metadata of a trial with how [log] reads each signal, as far as it changes it."""
+    found = {
+        name: {k: v for k, v in vars(one).items() if k == "path" or v != getattr(UNCHANGED, k)}
+        for name, one in readings(mapping).items()
+    }
+    return {READ_BY: json.dumps(found)}
+
+
+def readings_of(meta: Mapping[str, str]) -> dict[str, Reading]:
+    """Return how [log] read each signal of a trial; {} if its metadata, not trusted, don't say."""
+    try:
+        return {
+            str(name): Reading(
+                str(own.get("path", "")),
+                *(float(own.get(key, getattr(UNCHANGED, key))) for key in NUMBERS),
+            )
+            for name, own in json.loads(meta.get(READ_BY, "{}")).items()
+        }
+    except (ValueError, TypeError, AttributeError, RecursionError):
+        return {}
+
+
+def paths_of(meta: Mapping[str, str], names: Sequence[str]) -> tuple[str, ...]:
+    """Return the columns from which [log] read some signals of a trial; () if it does not say."""
+    known = readings_of(meta)
+    found = tuple(known[name].path for name in names if name in known)
+    return found if len(found) == len(names) and all(found) else ()
+
+
+def read_otherwise(
+    meta: Mapping[str, str], mapping: LogMapping | None, corrected: Collection[tuple[str, str]] = ()
+) -> tuple[str, ...]:
+    """Return the signals of a trial that [log] reads in another way now.
+
+    Args:
+        meta: the trial's metadata.
+        mapping: the present [log].
+        corrected: signals with a key of theirs that may differ.
+    """
+    before, now = readings_of(meta), readings(mapping)
+
+    def same(name: str, was: Reading, one: Reading) -> bool:
+        keys = [key for key in NUMBERS if (name, key) not in corrected]
+        alike = all(np.isclose(getattr(was, key), getattr(one, key)) for key in keys)
+        return alike and was.path in ("", one.path)
+
+    return tuple(n for n, one in now.items() if n in before and not same(n, before[n], one))
+
+
+def changed_since(
+    workspace: Folder, diagnosis: Diagnosis, usable: Collection[str]
+) -> tuple[str, ...]:
+    """Return the signals that [log] reads otherwise than it did for a diagnosis, else ().
+
+    What the diagnosis corrected itself may have been written into [log] since. Once there is a
+    trial that was read by the present [log], the others were left as they are on purpose.
+    """
+    if diagnosis.made is None or not workspace.config.log.names():
+        return ()
+    in_log = [one for one in diagnosis.preflight if one.log]
+    corrected = {
+        (name, key)
+        for one in in_log
+        for name in one.signal.split("+")
+        for key in NUMBERS
+        if key in one.log
+    }
+    if any(one.kind == "delay" for one in in_log):  # maybe of another
+        corrected |= {(name, "delay_s") for name in workspace.base_model.state_names}
+    found: tuple[str, ...] = ()
+    for one in workspace.whole_trials():
+        if one.stored.id in usable and READ_BY in one.meta:
+            found = read_otherwise(one.meta, workspace.log_mapping, corrected)
+            if not found:
+                return ()
+    return found
+
+
+def one_message(workspace: Folder) -> tuple[str, ...]:
+    """Return the states of a pose if one message holds them, else none.
+
+    A message has one stamp, so its position and its heading are late together or not at all.
+    """
+    model, mapping = workspace.base_model, workspace.log_mapping
+    pose = [*position(model), *filter(None, [heading(model)])]
+    if mapping is None or len(pose) < 2 or not set(pose) <= set(mapping.states):
+        return ()
+    topics = {mapping.states[name].path.partition(".")[0] for name in pose}
+    return tuple(pose) if len(topics) == 1 else ()
+
+
+# ingesting a log again
+
+
+def again(
+    workspace: Folder, meta: Mapping[str, str], candidate: str, *, waits: bool = False
+) -> NextCommand:
+    """Return the command that ingests a trial's log again.
+
+    If its candidate waits for a trial, it needs no name: it is recognised, or the log is refused.
+    """
+    what = ("--candidate", candidate) if candidate else ("--data",)
+    return NextCommand("ingest", (_log_of(workspace, meta), *(what if not waits else ())))
+
+
+def last_again(workspace: Folder, trials: Sequence[StoredTrial]) -> NextCommand | None:
+    """Return the command that ingests the last foreign log among some trials again."""
+    foreign = [one for one in trials if "source" in one.meta]
+    return again(workspace, foreign[-1].meta, foreign[-1].trial.candidate) if foreign else None
+
+
+def _log_of(workspace: Folder, meta: Mapping[str, str]) -> str:
+    """Return the path of a trial's log if it is in or beside a folder in use, else LOG."""
+    home = workspace.folder.resolve()
+    places = (folder / Path(meta["source"]).name for folder in (Path.cwd(), home, home.parent))
+    return next((os.path.relpath(place) for place in places if place.exists()), "LOG")
+
+
+# delays that [log] takes out as well as the model
+
+
+def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
+    """Return the delays found by a diagnosis that [log] now removes, by effect name [s].
+
+    Args:
+        workspace: the workspace with the current [log].
+        findings: the findings of the diagnosis, with the whole key of [log].
+    """
+    late = [one for one in findings if one.kind == "delay" and "delay_s" in one.keys]
+    log = readings(workspace.log_mapping) if late else {}
+    now = [log.get(one.signal, UNCHANGED).delay_s for one in late]
+    # the trial was read with the whole delay less what was found
+    gone = ((one, d) for one, d in zip(late, now, strict=True) if d > _most(one))
+    return {name: d for one, d in gone for name in late_effects([one])}
+
+
+def _most(one: Finding) -> float:
+    """Return the delay_s in [log] above which a delay that was found counts as removed."""
+    return float(one.keys["delay_s"]) - one.delay_s / 2
+
+
+def twice_in_time(workspace: Folder) -> Said | None:
+    """Return that [log] now removes delays that adopted effects have in the model as well.
+
+    A delay_s that trials were read with before the adoption is another part of the delay.
+    """
+    named = {str(one["name"]): float(one.get("d", 0.0)) for one in workspace.config.model.effects}
+    late = {n.removeprefix(SENSOR_DELAY): d for n, d in named.items() if SENSOR_DELAY in n}
+    if not late:
+        return None
+    log = readings(workspace.log_mapping)
+    metas = [one.meta for one in workspace.whole_trials() if READ_BY in one.meta]
+    before = readings_of(metas[-1]) if metas else {}
+    more = {n: log[n].delay_s - before.get(n, UNCHANGED).delay_s for n in late if n in log}
+    twice = [name for name, by in more.items() if by > late[name] / 2 > 0]
+    if not twice:
+        return None
+    keys = tuple(f"[log.state.{name}] delay_s" for name in twice)
+    effects = tuple(SENSOR_DELAY + name for name in twice)
+    return said("plan.delay_twice", *twice, keys=keys, effects=effects)
