@@ -33,12 +33,10 @@ from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 from grounded_trials.workspace.last_diagnosis import (
-    LEAST_STEPS,
-    Since,
     read_diagnosis,
     since_diagnosis,
 )
-from grounded_trials.workspace.next_step import next_command
+from grounded_trials.workspace.next_step import Situation
 
 MOST_RUNS = 200  # number of runs that are read: the latest, and those of compared candidates
 LOGS = 50  # number of logs that are read, the latest
@@ -72,11 +70,9 @@ def gather(workspace: Folder) -> Findings:
         better = better_model(workspace, diagnosis if named else None)
     except GroundedError as error:
         lost.append(Lost("the model as diagnosed", str(error)))
-    usable = [t.id for t in fitting if t.known_steps >= LEAST_STEPS]
-    since = since_diagnosis(workspace, diagnosis, usable) if diagnosis else Since()
+    since = since_diagnosis(workspace, diagnosis)
     if asked is None:
-        mapped = not unmapped(workspace)
-        asked = next_command(workspace, now, diagnosis, usable) if mapped else INSPECT
+        asked = INSPECT if unmapped(workspace) else Situation(workspace, now).then
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,

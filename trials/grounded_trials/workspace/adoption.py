@@ -37,7 +37,6 @@ from grounded_trials.workspace.last_diagnosis import (
     newer_alone,
     read_diagnosis,
     since_diagnosis,
-    usable_ids,
 )
 from grounded_trials.workspace.last_fit import fitted_in_vain, last_fit
 from grounded_trials.workspace.new_target import logged_target, to_plan
@@ -202,7 +201,7 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | Non
 
     Nothing is said of a diagnosis of another model, or if its effects were adopted and undone.
     """
-    if diagnosis is None or since_diagnosis(workspace, diagnosis, usable_ids(workspace)).changed:
+    if diagnosis is None or since_diagnosis(workspace, diagnosis).changed:
         return None
     then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.causes or diagnosis.effects
     if then is None or then.verb not in ("adopt", "fit") or not clauses:

@@ -10,7 +10,6 @@ verdict refers to the model and the trials of its time; effects adopted since ar
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -78,12 +77,9 @@ def diagnosable(workspace: Folder) -> list[Trial]:
 
 
 def usable_ids(workspace: Folder) -> list[str]:
-    """Return the ids of the trials that a diagnosis can use, in order of arrival.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
-    """
-    return [trial.id for trial in diagnosable(workspace)]
+    """Return the ids of the undamaged trials that a diagnosis can use, in order of arrival."""
+    logs = [one.measured for one in workspace.whole_trials()]
+    return [log.id for log in logs if workspace.fits(log) and log.known_steps >= LEAST_STEPS]
 
 
 def left_out(workspace: Folder) -> list[Finding]:
@@ -170,15 +166,11 @@ def model_print(workspace: Folder) -> str:
     return sha256(model_fingerprint(apart).encode() + ends)[:16]
 
 
-def since_diagnosis(workspace: Folder, diagnosis: Diagnosis, usable: Sequence[str]) -> Since:
-    """Return what changed since a diagnosis was made.
-
-    Args:
-        workspace: the workspace with the current model.
-        diagnosis: the diagnosis.
-        usable: the trials that can be used now, in order of arrival.
-    """
-    model, made = workspace.config.model, made_from(diagnosis)
+def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
+    """Return what changed in a workspace since a diagnosis was made; nothing without one."""
+    if diagnosis is None:
+        return Since()
+    model, made, usable = workspace.config.model, made_from(diagnosis), usable_ids(workspace)
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -41,21 +41,34 @@ class Situation:
     Args:
         workspace: the workspace, whose model may have changed since the diagnosis.
         now: the standing of its search.
-        diagnosis: the last diagnosis, or None.
-        usable: the trials that a diagnosis can use now, in order of arrival.
+        found: a diagnosis that was just made; None: the last one, if any.
     """
 
     workspace: Folder
     now: Standing
-    diagnosis: Diagnosis | None
-    usable: Sequence[str]
+    found: Diagnosis | None = None
+
+    @cached_property
+    def diagnosis(self) -> Diagnosis | None:
+        """The last diagnosis, or None."""
+        return self.found or readable_diagnosis(self.workspace.reports)
 
     @cached_property
     def since(self) -> Since:
         """What changed since the diagnosis."""
-        if self.diagnosis is None:
-            return Since()
-        return since_diagnosis(self.workspace, self.diagnosis, self.usable)
+        return since_diagnosis(self.workspace, self.diagnosis)
+
+    @cached_property
+    def usable(self) -> int:
+        """How many trials a diagnosis can use now."""
+        return self.since.usable if self.diagnosis else len(usable_ids(self.workspace))
+
+    @property
+    def then(self) -> NextCommand:
+        """The command to type next, by `NEXT`."""
+        rows = (row for row in NEXT if self.now.phase in row[0])
+        then: NextCommand = next(command(self) for _, holds, command in rows if holds(self))
+        return to_plan(self.workspace) if then == PROPOSE else then
 
     @cached_property
     def adopt(self) -> NextCommand | None:
@@ -82,7 +95,7 @@ class Situation:
 
         A single run would confirm nothing.
         """
-        new = len(self.usable) if self.diagnosis is None else self.since.newer
+        new = self.usable if self.diagnosis is None else self.since.newer
         return bool(self.now.doubt) and new >= LOST
 
     @property
@@ -181,16 +194,6 @@ NEXT: tuple[Row, ...] = (
 )
 
 
-def next_command(
-    workspace: Folder, now: Standing, diagnosis: Diagnosis | None, usable: Sequence[str]
-) -> NextCommand:
-    """Return the command to type next by `NEXT`, see `Situation`."""
-    here = Situation(workspace, now, diagnosis, usable)
-    rows = (row for row in NEXT if now.phase in row[0])
-    then: NextCommand = next(command(here) for _, holds, command in rows if holds(here))
-    return to_plan(workspace) if then == PROPOSE else then
-
-
 def outlook(now: Standing, then: NextCommand) -> Standing:
     """Return the standing; of a search that has ended, also that the model may change."""
     goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT)
@@ -226,18 +229,16 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
             handed = any(workspace.candidate_path("c").parent.glob("c*.mcap"))
             ran = handed and any(one.candidate for one in workspace.task_trials())
             if ran and (now := standing_in(workspace)).phase is Phase.AWAIT:
-                return Situation(workspace, now, None, ()).run
+                return Situation(workspace, now).run
         return DIAGNOSE
-    none_stood = Situation(workspace, now, None, ()).none_stood
-    if now.phase in (Phase.PROPOSE, Phase.AWAIT) and not (now.doubt or none_stood):
-        return PROPOSE
-    last, usable = readable_diagnosis(workspace.reports), usable_ids(workspace)
-    return next_command(workspace, now, last, usable)
+    here = Situation(workspace, now)
+    goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT) and not (now.doubt or here.none_stood)
+    return PROPOSE if goes_on else here.then
 
 
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
     """Return the command after a diagnosis: adopt claims, run another trial, or read the report."""
-    here = Situation(workspace, _standing_ahead(workspace), found, usable_ids(workspace))
+    here = Situation(workspace, _standing_ahead(workspace), found)
     if not found.no_cause:
         if here.adopt is not None:
             return here.adopt
@@ -246,7 +247,7 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
         settled = found.kind in ("none", "unknown") or found.contested  # nothing to adopt
         if not settled or not workspace.config.task.target:
             return REPORT
-        return next_command(workspace, here.now, found, here.usable)
+        return here.then
     return here.record if undrawn(workspace) else here.run
 
 
@@ -263,9 +264,7 @@ def after_fit(workspace: Folder) -> NextCommand:
 
     It is what else the last diagnosis suggests, or a new diagnosis if model or trials changed.
     """
-    if (found := readable_diagnosis(workspace.reports)) is None:
+    here = Situation(workspace, _standing_ahead(workspace))
+    if here.diagnosis is None or here.since.changed or here.since.newer:
         return DIAGNOSE
-    here = Situation(workspace, _standing_ahead(workspace), found, usable_ids(workspace))
-    if here.since.changed or here.since.newer:
-        return DIAGNOSE
-    return next_command(workspace, here.now, found, here.usable)
+    return here.then

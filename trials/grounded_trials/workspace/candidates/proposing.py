@@ -34,14 +34,8 @@ from grounded_trials.workspace.candidates.search_state import (
 )
 from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import (
-    Since,
-    left_out,
-    readable_diagnosis,
-    since_diagnosis,
-    usable_ids,
-)
-from grounded_trials.workspace.next_step import Situation, next_command, outlook
+from grounded_trials.workspace.last_diagnosis import Since, left_out
+from grounded_trials.workspace.next_step import Situation, outlook
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 from grounded_trials.workspace.placing import FromStarts, from_starts
 
@@ -187,9 +181,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)
     lacks = _lacks(workspace, status.diagnosis) if candidate and status.diagnosis else None
-    unsure = (
-        now.doubt and Situation(workspace, now, status.diagnosis, usable_ids(workspace)).doubted
-    )
+    unsure = now.doubt and Situation(workspace, now, status.diagnosis).doubted
     notes += [one for one in (lacks, now.doubt if unsure else None) if one]
     if candidate is None:
         return _ended(workspace, proposal, status, notes, asked)
@@ -324,13 +316,8 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     Raises:
         GroundedError: if a stored file is damaged.
     """
-    usable = usable_ids(workspace)
-    last = readable_diagnosis(workspace.reports)
-    since = since_diagnosis(workspace, last, usable) if last else None
-    then = next_command(workspace, standing, last, usable)
-    lost = unmapped(workspace)
-    if lost:
-        then = INSPECT
+    here, lost = Situation(workspace, standing), unmapped(workspace)
+    last, then = here.diagnosis, INSPECT if lost else here.then
     gone = () if standing.phase is Phase.PROPOSE else _disowned(standing, workspace.discarded())
     every = [
         *notes,
@@ -340,7 +327,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *_namesakes(workspace),
         *not_counted(uncounted(workspace, workspace.trials(), standing)),
         *left_out(workspace),
-        *(since.findings if since else ()),
+        *here.since.findings,
     ]
     best = standing.incumbent
     return Status(
@@ -351,8 +338,8 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         workspace.discarded(),
         off_target_of(workspace.task, best.trials if best else ()),
         last,
-        since,
-        _settled(workspace, last, since),
+        here.since if last else None,
+        _settled(workspace, last, here.since),
         much_noise(best.noise_cost, best.utility) if best else None,
     )
 
@@ -363,13 +350,13 @@ def _lacks(workspace: Folder, diagnosis: Diagnosis) -> Finding | None:
     return not_adopted(workspace, diagnosis)
 
 
-def _settled(workspace: Folder, last: Diagnosis | None, since: Since | None) -> Settled | None:
+def _settled(workspace: Folder, last: Diagnosis | None, since: Since) -> Settled | None:
     """Return what was adopted; None, and without slow imports, if nothing was."""
     if not (workspace.config.model.effects or workspace.config.model.params):
         return None
     from grounded_trials.workspace.adoption import settled_in
 
-    return settled_in(workspace, last, since or Since())
+    return settled_in(workspace, last, since)
 
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:

@@ -27,11 +27,7 @@ from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, s
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.identity import other_task
-from grounded_trials.workspace.last_diagnosis import (
-    readable_diagnosis,
-    since_diagnosis,
-    usable_ids,
-)
+from grounded_trials.workspace.last_diagnosis import readable_diagnosis, since_diagnosis
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate, Tried
@@ -73,8 +69,7 @@ def answered(workspace: Folder, now: Standing) -> Standing:
         return now
     if (found := readable_diagnosis(workspace.reports)) is None:
         return now
-    since = since_diagnosis(workspace, found, usable_ids(workspace))
-    return now.answered() if since.settled else now
+    return now.answered() if since_diagnosis(workspace, found).settled else now
 
 
 def planned(

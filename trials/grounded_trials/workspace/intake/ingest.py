@@ -220,7 +220,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     if any(one.weight is Weight.ASIDE for one in told) and not aside:
         then = NextCommand("discard", (added.id,))
     elif now and waits and aside:
-        then = Situation(workspace, now, None, ()).run
+        then = Situation(workspace, now).run
     else:
         then = after_log(workspace, verdict, now)
     return Ingested(
