@@ -41,7 +41,7 @@ def made(tmp_path_factory):
 def indexed(made, monkeypatch):
     """Small enough for a test, large enough for the index."""
     monkeypatch.setattr(folder_module, "INDEXED_FROM", 100)
-    file = made.store.folder / ".index.sqlite"
+    file = made.store.folder / ".index.json"
     file.unlink(missing_ok=True)
     return made, file
 

@@ -1,9 +1,9 @@
 """An index of a workspace's files, so that commands need not read every file each time.
 
-trials/.index.sqlite is derived data: it may be deleted, and is rebuilt if it is missing, damaged or
-of another version. A row holds what was found out about a file that was read and verified; it is
-used as long as the file's size, times and inode are unchanged and the row's own checksum matches.
-Arrays are read on first access.
+trials/.index.json is derived data: a document that may be deleted, and is rebuilt if it is missing,
+damaged or of another version. It holds what was found out about files that were read and verified,
+which is used as long as a file's size, times and inode are unchanged. Arrays are read on first
+access.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import sqlite3
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import fields
@@ -21,15 +20,16 @@ from typing import Any, Self, cast
 
 import numpy as np
 
+from grounded.errors import GroundedError
 from grounded.frozen import Array, readonly
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.store.documents import read_document, write_document
 
 Worth = Callable[[str, Callable[[], float]], float]
 ARRAYS = ("policy", "predicted_states", "predicted_inputs")  # of a candidate
-_VERSION = 6  # of the table and of the result of `about_trial`
-_TABLE = "CREATE TABLE files (name TEXT PRIMARY KEY, stamp TEXT, about TEXT, proof BLOB);"
+VERSION = 6  # of the result of `about_trial`
 
 
 class KnownTrial(Trial):
@@ -154,37 +154,12 @@ class Index:
     """
 
     def __init__(self, folder: Path) -> None:
-        self._path = folder / ".index.sqlite"
-        self._rows: dict[str, tuple[str, Any]] = {}  # stamp and what was found out, by name
-        self._file = self._opened()
-
-    def __del__(self) -> None:
-        if file := getattr(self, "_file", None):
-            file.close()
-
-    def _opened(self) -> sqlite3.Connection:
-        """Open the index; if it can't be used, return an empty one in memory."""
-        for path in (self._path, self._path, ":memory:"):
-            with suppress(sqlite3.Error, OSError):
-                file = sqlite3.connect(path, timeout=2.0)
-                try:
-                    if file.execute("PRAGMA user_version").fetchone()[0] != _VERSION:
-                        file.executescript(f"BEGIN;{_TABLE}PRAGMA user_version={_VERSION};COMMIT;")
-                    self._load(file)
-                    return file
-                except sqlite3.Error:
-                    file.close()
-                    raise
-            with suppress(OSError):  # it is damaged, or of another version
-                self._path.unlink(missing_ok=True)
-        raise AssertionError("a database in memory can always be made")
-
-    def _load(self, file: sqlite3.Connection) -> None:
-        """Load the rows whose checksums match; parsing all texts at once is the fastest."""
-        query = "SELECT name, stamp, about, proof FROM files"
-        rows = [row for row in file.execute(query) if _proof(*row[:3]) == row[3]]
-        abouts = json.loads(f"[{','.join(row[2] for row in rows)}]")
-        self._rows = {row[0]: (row[1], about) for row, about in zip(rows, abouts, strict=True)}
+        self._path, self._changed = folder / ".index.json", False
+        self._rows: dict[str, list[Any]] = {}  # stamp and what was found out, by name
+        with suppress(OSError, ValueError, RecursionError, GroundedError):
+            document = read_document(self._path)
+            if document["version"] == VERSION:
+                self._rows = document["rows"]
 
     def known(self, name: str, path: Path, learn: Callable[[], Any]) -> Any:
         """Return what is known of a file; reads the file if it is new or has changed.
@@ -195,14 +170,10 @@ class Index:
             learn: reads and verifies the file, and returns a JSON value.
         """
         stamp, row = _stamp(path), self._rows.get(name)
-        if row is not None and row[0] == stamp:
-            return row[1]
-        text = json.dumps(learn())
-        self._rows[name] = stamp, json.loads(text)
-        values = (name, stamp, text, _proof(name, stamp, text))
-        with suppress(sqlite3.Error):  # read-only, disk full or locked: the next command is slower
-            self._file.execute("INSERT OR REPLACE INTO files VALUES (?, ?, ?, ?)", values)
-        return self._rows[name][1]
+        if row is None or row[0] != stamp:
+            row = self._rows[name] = [stamp, json.loads(json.dumps(learn()))]
+            self._changed = True
+        return row[1]
 
     def trial(
         self, path: Path, read: Callable[[], tuple[Trial, dict[str, str], bytes | None]]
@@ -240,9 +211,11 @@ class Index:
         return KnownCandidate.of(lambda: read()[0], known.pop("own")), known
 
     def save(self) -> None:
-        """Commit new entries; if that fails, their files are read again by the next command."""
-        with suppress(sqlite3.Error):
-            self._file.commit()
+        """Write new entries; if that fails, their files are read again by the next command."""
+        if self._changed:
+            rows, self._changed = {"version": VERSION, "rows": self._rows}, False
+            with suppress(GroundedError):
+                write_document(self._path, rows, nan=True, indent=None)
 
 
 def _stamp(path: Path) -> str:
@@ -252,7 +225,3 @@ def _stamp(path: Path) -> str:
     except OSError:
         return ""
     return f"{found.st_size}-{found.st_mtime_ns}-{found.st_ctime_ns}-{found.st_ino}"
-
-
-def _proof(*parts: str) -> bytes:
-    return hashlib.sha256("\0".join(map(str, parts)).encode()).digest()
