@@ -129,7 +129,7 @@ def main():
     folder, long = place / "many", place / "long"
     made(folder, given.trials, given.candidates)
     at = ("-C", str(folder))
-    (folder / "trials" / ".index.sqlite").unlink(missing_ok=True)
+    (folder / "trials" / ".index.json").unlink(missing_ok=True)
     timed("status, first", *at, "status")
     for _ in range(3):
         timed("status", *at, "status")
