@@ -135,7 +135,7 @@ def fit_in(
     if apply and found.worse:
         raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
-        lacks = not_adopted(workspace, readable_diagnosis(workspace.folder))
+        lacks = not_adopted(workspace, readable_diagnosis(workspace.reports))
         if lacks is not None and lacks.then is not None and lacks.then.verb == "adopt":
             # parameters alone stand for what the last diagnosis has found beside them
             told = replace(found, findings=(*found.findings, lacks))
