@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
-from grounded.accounts.sound_trials import stop_at_folded
 from grounded.errors import GroundedError
 from grounded.fit import Fit
 from grounded.result import Document
@@ -36,14 +35,11 @@ def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
         names: short names of the trials; empty: all usable ones.
 
     Raises:
-        GroundedError: if there is none, or one of those named can't be used; for an angle in
-            degrees that was unwrapped in radians. The plan's model with an adopted delay of that
-            sensor has no rows that show it.
+        GroundedError: if there is none, or one of those named can't be used.
     """
     used = diagnosable(workspace)
     names = named_trials(workspace, names, ids_of(used))
     share = share_of([trial for trial in used if not names or trial.id in names])
-    stop_at_folded(workspace.base_model, share.trials)
     guessed = {t.stored.id: t.meta.get("estimated", "").split(",") for t in workspace.trials()}
     measured: list[Trial] = []
     for trial in share.trials:
