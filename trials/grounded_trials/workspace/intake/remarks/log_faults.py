@@ -24,6 +24,7 @@ from grounded_trials.workspace.readings import paths_of, read_by
 if TYPE_CHECKING:
     from grounded.accounts.table import Account, Told
 
+TURNS = 5.0  # times its bound in [safety] from which on an angle is suspect
 COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
 KINDS = "unit sign compass exchange dead offset axes pace clock"
 COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
@@ -43,7 +44,10 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
             return ()
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
-    faults = [*column_faults(workspace, known), *_clocks_apart(workspace, trial)]
+    faults = column_faults(workspace, known)
+    if not any(one.code == "log.unit" for one in faults):
+        faults += _beyond_safety(workspace.task, trial)
+    faults += _clocks_apart(workspace, trial)
     return tuple(_mended(workspace, known, one, own=own) for one in faults)
 
 
@@ -147,6 +151,21 @@ def _as_sent(workspace: Folder, trial: Trial, fault: Account) -> bool:
     run = trial.until(policy.horizon)
     logged, mended = (follows(policy, one, late) for one in (run, fault.mended(run)))
     return logged is not None and logged.alike and not (mended is not None and mended.alike)
+
+
+def _beyond_safety(task: Task, trial: Trial) -> list[Finding]:
+    """Return faults for angles far beyond [safety] that would be about inside in degrees."""
+    from grounded.accounts.reported import scaled
+    from grounded.accounts.table import DEGREES
+
+    assert task.safety_low is not None and task.safety_high is not None
+    allowed = np.maximum(np.abs(task.safety_low), np.abs(task.safety_high))
+    turns = np.nan_to_num(np.abs(trial.states)).max(axis=0, initial=0.0) / np.maximum(
+        allowed, 1e-12
+    )
+    units, odd = list(task.model.states.items()), (turns > TURNS) & (turns <= DEGREES * 2)
+    odd &= np.array([unit == "rad" for _, unit in units])
+    return [scaled(task.model, [units[i][0]], DEGREES, "deg") for i in np.flatnonzero(odd)]
 
 
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Finding]:
