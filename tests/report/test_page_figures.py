@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 from dataclasses import replace
-from itertools import combinations
 
 import numpy as np
 import pytest
@@ -16,16 +15,12 @@ from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import (
-    COLOURS,
-    DASHES,
-    STEPS,
     Curve,
     Figure,
     Panel,
     log_ticks,
-    rgb,
 )
-from grounded.figures.interactive import PAPER, plotted
+from grounded.figures.interactive import plotted
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -121,41 +116,6 @@ def test_results_plot_what_the_page_shows(cart):
         assert len(drawn.data) >= len(titles)
     traces = findings.best.candidate.plot().data
     np.testing.assert_allclose(traces[0].y, findings.best.candidate.predicted_states[:, 0])
-
-
-# of linear RGB: how two kinds of colour blindness see it (Machado et al., 2009), and XYZ
-SEEN = np.array(
-    [
-        [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
-        [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
-    ]
-)
-XYZ = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
-
-
-def linear(colour):
-    value = np.array(rgb(colour)) / 255
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4)
-
-
-def lab(colour):
-    x, y, z = np.cbrt(XYZ @ np.clip(colour, 1e-4, 1) / [0.9505, 1.0, 1.089])
-    return np.array([116 * y - 16, 500 * (x - y), 200 * (y - z)])
-
-
-@pytest.mark.parametrize("dark", [0, 1])
-def test_colours_stand_out_and_are_told_apart_by_the_colour_blind(dark):
-    paper = linear(PAPER["paper"][dark]) @ XYZ[1]
-    for role, pair in COLOURS.items():
-        light = linear(pair[dark]) @ XYZ[1]
-        ratio = (max(light, paper) + 0.05) / (min(light, paper) + 0.05)
-        assert ratio >= 3.0, role  # WCAG 2.2, 1.4.11
-    for together in (("model", "best", "real", "other", "step2"), ("model", "best", *STEPS)):
-        for a, b in combinations(together, 2):
-            for seen in SEEN:
-                one, two = (lab(seen @ linear(COLOURS[name][dark])) for name in (a, b))
-                apart = np.linalg.norm(one - two) > 8.0
-                assert apart or DASHES.get(a) != DASHES.get(b), (a, b)
 
 
 def test_logarithmic_panels_show_what_has_a_logarithm():
