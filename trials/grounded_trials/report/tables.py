@@ -48,7 +48,6 @@ from grounded_trials.wording import (
     percent,
     rendered,
     shown,
-    spread,
     with_unit,
 )
 from grounded_trials.workspace.candidates.proposing import not_counted
@@ -228,25 +227,15 @@ def _task(findings: Findings) -> list[Block]:
 
 def _candidates(findings: Findings) -> list[Block]:
     """Return the candidates with their trials; of many, a part and the number left out."""
-    best, now = findings.standing.incumbent, findings.standing
+    now = findings.standing
+    best, header = now.incumbent, (*now.table()[1][:-1], "verdict ", "from", "trials ")
     kept, left = few(findings.history, MOST_DRAWN)
     rows = [
-        {
-            "candidate": (c := tried.candidate).id,
-            "from": c.base or "-",
-            "iter.": str(c.iteration),
-            "alpha": f"{c.alpha:g}",
-            "damping": figure(c.damping, 2) if c.base else "-",
-            "predicted utility": figure(tried.promised),
-            "real utility": figure(tried.utility),
-            "std. error": spread(tried.standard_error),
-            "verdict ": now.verdict(tried),
-            "trials ": " ".join(t.id for t in tried.trials) or "none",
-        }
-        for tried in kept
+        (*now.row(one), one.candidate.base or "-", " ".join(t.id for t in one.trials) or "none")
+        for one in kept
     ]
     strong = {k for k, t in enumerate(kept) if best and t.candidate is best.candidate}
-    made = table("candidates", list(rows[0]), [list(cells.values()) for cells in rows], strong)
+    made = table("candidates", header, rows, strong)
     status = rendered(NextCommand("status"), findings.folder)
     more = [Block("text", f"{left} more"), Block("command", status, "c-status")] * bool(left)
     why = legend("", [t.candidate.iteration for t in kept])

@@ -144,11 +144,9 @@ def _seen_in(findings: Findings, view: View) -> Panel:
     runs = [("other", r.label, r) for r in others]
     runs += [(role, name_of(role, r), r) for role, r in shown]
     drawn = [(r.trial.states, role, name, r.trial.id, "line") for role, name, r in runs]
-    drawn += [
-        (c.predicted_states, "predicted", f"predicted for {c.id}", r.trial.id, "ghost")
-        for _, _, r in runs
-        for c in (r.candidate,)
-    ]
+    for _, _, r in runs:
+        name = f"predicted for {r.candidate.id}"
+        drawn.append((r.candidate.predicted_states, "predicted", name, r.trial.id, "ghost"))
     drawn += [
         (states, role, name, "", "line")
         for role, name, states in named_paths(findings)
@@ -190,18 +188,17 @@ def _enlarged(findings: Findings, view: View) -> list[Panel]:
     factor = enlarging(view.place(compared(findings)[-1][1].trial.states), desired)
     if factor < SEEN:
         return []
-    curves, note, cut = [], "", False
+    curves, note = [], ""
     for role, name, states in named_paths(findings):
         near = desired[: len(states)]
         path = near + factor * (view.place(states) - near)
         off = np.abs(path - near).max(axis=1) > ENLARGED_TO * np.ptp(desired, axis=0).max()
+        path[off] = np.nan
         if off.mean() > MOSTLY:
             note = f"{role} outside"
-            continue
-        path[off] = np.nan
-        cut |= bool(off.any())
-        width = WIDTHS.get(role, 1.5)
-        curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
+        else:
+            width = WIDTHS.get(role, 1.5)
+            curves.append(Curve(path[:, 0], path[:, 1], role, name, width))
     title = f"Deviations {factor:g} times enlarged"
     return [Panel(title, *view.names, tuple(curves), equal=True, note=note, kind="path")]
 

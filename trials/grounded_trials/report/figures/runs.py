@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -29,6 +29,7 @@ from grounded_trials.report.figures.paths import crash, name_of, named_paths, pa
 from grounded_trials.report.findings import (
     ESTIMATED,
     Findings,
+    Run,
     compared,
     prediction_error,
     selection,
@@ -54,17 +55,22 @@ def all_figures(findings: Findings) -> list[Figure]:
     return [figure for figure in made if figure is not None]
 
 
-def _distance(findings: Findings, axes: list[int]) -> Panel:
-    """Draw the distance of the position from the desired one at the same time."""
-    task = findings.task
-    shown = compared(findings)
-    off = [np.linalg.norm(tracking_error(task, run.trial)[:, axes], axis=1) for _, run in shown]
+def _compared(
+    findings: Findings, values: Callable[[Run], Array], column: int
+) -> tuple[list[Curve], list[Dot]]:
+    """Return a column of each compared run's values, with crosses where the run ended early."""
+    shown, dt = compared(findings), findings.task.dt
+    drawn = [values(run)[:, column] for _, run in shown]
     curves = [
-        _over_time(values, task.dt, role, name_of(role, run))
-        for values, (role, run) in zip(off, shown, strict=True)
+        _over_time(each, dt, role, name_of(role, run))
+        for each, (role, run) in zip(drawn, shown, strict=True)
     ]
-    unit, marks = task.model.states[task.model.state_names[axes[0]]], _crashes(findings, off)
-    return _timed("distance from the desired position", unit, curves, spare=50.0, marks=marks)
+    dots = []
+    for each, (role, run) in zip(drawn, shown, strict=True):
+        if (last := crash(run)) is not None:
+            note = f"{name_of(role, run)} ended early"
+            dots.append(Dot(last * dt, float(each[last]), role, note, "cross"))
+    return curves, dots
 
 
 def state_figure(findings: Findings) -> Figure | None:
@@ -72,131 +78,104 @@ def state_figure(findings: Findings) -> Figure | None:
 
     Its target is drawn along the way or at the end, where [reward] weighs it.
     """
-    task = findings.task
-    if len(named_paths(findings)) < 2:
+    task, paths = findings.task, named_paths(findings)
+    if len(paths) < 2:
         return None
-    wanted, panels, ends = asked_for(task), [], False
+    wanted, panels, end = asked_for(task), [], tuple[Key, ...]()
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
         along = i in wanted and task.reward.state[i] > 0
         curves = [
             _over_time(states[:, i], task.dt, role, words)
-            for role, words, states in named_paths(findings)
+            for role, words, states in paths
             if role != "desired" or along
         ]
-        marks = _crashes(findings, [run.trial.states[:, i] for _, run in compared(findings)])
+        marks = _compared(findings, lambda run: run.trial.states, i)[1]
         if i in wanted and not along:
             at, value = task.horizon * task.dt, float(task.target[-1, i])
             marks.append(Dot(at, value, "desired", DESIRED_END, "ring"))
-            ends = True
-        panel = _timed(name, unit, curves, marks=marks)
-        notes = (panel.note, ESTIMATED * (name in findings.estimated))
-        panels.append(replace(panel, note="; ".join(filter(None, notes))))
-    end = (Key("desired", DESIRED_END, "ring"),) * ends
+            end = (Key("desired", DESIRED_END, "ring"),)
+        note = ESTIMATED * (name in findings.estimated)
+        panels.append(_timed(name, unit, curves, marks=marks, note=note))
     return Figure("states", "States over time", "", tuple(panels), (*legend(panels), *end))
 
 
 def error_figure(findings: Findings) -> Figure | None:
     """Return the figure of the errors from the target, and from the run's own prediction."""
-    task = findings.task
-    shown, panels = compared(findings), []
+    task, shown, panels = findings.task, compared(findings), []
     if not shown:
         return None
     scene = scene_of(task.model)
-    if scene.spatial and set(scene.axes) <= set(tracked(task)):
-        panels.append(_distance(findings, list(scene.axes)))
+    axes = list(scene.axes)
+    if scene.spatial and {*axes} <= {*tracked(task)}:
+
+        def distance(run: Run) -> Array:
+            off = tracking_error(task, run.trial)[:, axes]
+            return np.asarray(np.linalg.norm(off, axis=1, keepdims=True))
+
+        curves, marks = _compared(findings, distance, 0)
+        name, unit = "distance from the desired position", list(task.model.states.values())[axes[0]]
+        panels.append(_timed(name, unit, curves, spare=50.0, marks=marks))
     for i in (i for i in reading_order(task) if i in asked_for(task)):
         name, unit = list(task.model.states.items())[i]
-        off = [tracking_error(task, run.trial)[:, i] for _, run in shown]
-        curves = [
-            _over_time(values, task.dt, role, name_of(role, run))
-            for values, (role, run) in zip(off, shown, strict=True)
-        ]
+        curves, marks = _compared(findings, lambda run: tracking_error(task, run.trial), i)
         _, run = shown[-1]
         gap, words = prediction_error(task, run)[:, i], f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
-        marks = _crashes(findings, off)
         panels.append(_timed(f"{name} − target", unit, curves, spare=50.0, marks=marks))
     return Figure("error", "Tracking error", "", tuple(panels), legend(panels))
 
 
 def input_figure(findings: Findings) -> Figure | None:
-    """Return the figure of each input over time, with its limits."""
-    task, shown, panels = findings.task, compared(findings), []
-    if not shown:
+    """Return the figure of each input over time, with its limits: commands with zero-order hold."""
+    task, panels = findings.task, []
+    if not compared(findings):
         return None
     for j, (name, unit) in enumerate(task.model.inputs.items()):
-        curves = [
-            _held(run.trial.inputs[:, j], task.dt, role, name_of(role, run)) for role, run in shown
-        ]
+        held = _compared(
+            findings, lambda run: np.vstack([run.trial.inputs, run.trial.inputs[-1:]]), j
+        )[0]
+        curves = [replace(curve, style="steps") for curve in held]
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
-        sent = [curve.y for curve in curves]
+        sent, note = [curve.y for curve in curves], ""
         if np.ptp(fitted(sent)) < FLAT * np.ptp(fitted([*sent, np.array(limits)])):
             ends = listed(f"{v:g}" for v in limits).replace("-", "−")
-            note = f"limit{'s' * (len(limits) > 1)} {with_unit(ends, unit)}"
-            panels.append(replace(_timed(name, unit, curves), note=note))
-        else:
-            panels.append(_timed(name, unit, curves, limits))
+            note, limits = f"limit{'s' * (len(limits) > 1)} {with_unit(ends, unit)}", []
+        panels.append(_timed(name, unit, curves, limits, note=note))
     return Figure("inputs", "Inputs", "", tuple(panels), legend(panels))
 
 
 def bias_figure(findings: Findings) -> Figure | None:
     """Return the figure of the crude model's bias along the run, by iteration."""
-    task = findings.task
+    task, best = findings.task, findings.best
     runs = selection(findings.improvements, ITERATIONS)
     if not runs:
         return None
+    roles = ["model", *(STEPS[k % 3] for k in range(len(runs) - 2)), "best"][: len(runs)]
+    drawn = [
+        (run.residual, role, f"{run.candidate.id}, iteration {run.candidate.iteration}", 1.0)
+        for role, run in zip(roles, runs, strict=True)
+    ]
+    if best is not None and best.explained is not None and findings.better is not None:
+        drawn.append((best.explained, "predicted", f"model {findings.better.name}", 1.5))
     panels = []
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
-        drawn: list[tuple[Array, str, str, float]] = []
-        for k, run in enumerate(runs):
-            role = "model" if k == 0 else "best" if k == len(runs) - 1 else STEPS[(k - 1) % 3]
-            words = f"{run.candidate.id}, iteration {run.candidate.iteration}"
-            drawn.append((run.residual[:, i], role, words, 1.0))
-        best = findings.best
-        if best is not None and best.explained is not None and findings.better is not None:
-            words = f"model {findings.better.name}"
-            drawn.append((best.explained[:, i], "predicted", words, 1.5))
-        window = window_of([values for values, *_ in drawn])
-        curves = [
-            _means(values / task.dt, window, task.dt, role, words, width)
-            for values, role, words, width in drawn
-        ]
-        panel = _timed(name, per_second(unit), curves)
-        if window > 1:
-            note = f"means: {window * task.dt:.2g} s"
-            panel = replace(panel, note="; ".join(filter(None, (panel.note, note))))
-        panels.append(panel)
+        window = window_of([values[:, i] for values, *_ in drawn])
+        middle = 0.5 * (window - 1) * task.dt  # of the steps of a mean
+        curves = []
+        for values, role, words, width in drawn:
+            mean = averaged(values[:, i] / task.dt, window)
+            curve = _over_time(mean, window * task.dt, role, words, width)
+            curves.append(replace(curve, x=curve.x + middle))
+        note = f"means: {window * task.dt:.2g} s" * (window > 1)
+        panels.append(_timed(name, per_second(unit), curves, note=note))
     return Figure("bias", "Bias", "", tuple(panels), legend(panels))
-
-
-def _means(values: Array, window: int, dt: float, role: str, name: str, width: float) -> Curve:
-    """Return a curve of means over `window` steps, each in the middle of its steps."""
-    curve = _over_time(averaged(values, window), window * dt, role, name, width)
-    return replace(curve, x=curve.x + 0.5 * (window - 1) * dt)
 
 
 def _over_time(values: Array, dt: float, role: str, name: str, width: float = 1.5) -> Curve:
     times: Array = np.arange(len(values), dtype=np.float64) * dt
     return Curve(times, values, role, name, width)
-
-
-def _held(values: Array, dt: float, role: str, name: str) -> Curve:
-    """Return a curve of commands with zero-order hold, including the last step."""
-    curve = _over_time(np.append(values, values[-1:]), dt, role, name)
-    return replace(curve, style="steps")
-
-
-def _crashes(findings: Findings, drawn: Sequence[Array]) -> list[Dot]:
-    """Return crosses at the ends of the drawn values of compared runs that ended early."""
-    dots = []
-    for values, (role, run) in zip(drawn, compared(findings), strict=True):
-        last = crash(run)
-        if last is not None:
-            at, note = last * findings.task.dt, f"{name_of(role, run)} ended early"
-            dots.append(Dot(at, float(values[last]), role, note, "cross"))
-    return dots
 
 
 def _timed(
@@ -206,10 +185,11 @@ def _timed(
     limits: Sequence[float] = (),
     spare: float = 3.0,
     marks: Sequence[Dot] = (),
+    note: str = "",
 ) -> Panel:
     """Return a panel over time, scaled so that a diverging first run does not flatten the others.
 
-    If that run is cut off, a note states the values that it reaches.
+    If that run is cut off, its note states the values that it reaches.
     """
     asked = [dot.y for dot in marks if dot.role == "desired"]
     calm = [c.y for c in curves if c.role != "model"] + [np.array([*limits, *asked])]
@@ -229,7 +209,7 @@ def _timed(
         tuple(marks),
         rules=tuple(Rule(v, "limit", "limit") for v in limits),
         y_range=(low, high),
-        note=_cut_off(wild, low, high),
+        note="; ".join(filter(None, (_cut_off(wild, low, high), note))),
         kind="time",
     )
 
