@@ -29,7 +29,7 @@ from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
 from grounded.experiments.jobs import Job, Progress, run_jobs
 from grounded.findings import found
-from grounded_trials.plain_file import unreadable
+from grounded_trials.plain_file import read_file, unreadable
 from grounded_trials.starting.examples import toml_of
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import DIGITS, Store, made_folder, write_atomically
@@ -42,6 +42,7 @@ from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.task_file import write_target
 
 MANIFEST, TIMES = "manifest.json", "times.json"
+LIMIT = 2**26  # [bytes] of a manifest or a label
 
 
 def write_cases(
@@ -111,15 +112,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         GroundedError: if there is no manifest, or it can't be read.
     """
     path = folder / MANIFEST
-    if not folder.is_dir():
-        raise refused("file.missing", folder)
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
-        return dict(document["cases"])
-    except FileNotFoundError:
-        raise refused("file.missing", path) from None
-    except OSError as error:
-        raise unreadable(path, error) from None
+        return dict(json.loads(read_file(path, LIMIT))["cases"])
     except (ValueError, KeyError, TypeError):
         raise unreadable(path, "format", kind="challenge") from None
 
@@ -131,12 +125,7 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
         GroundedError: if it is missing or was changed.
     """
     path = labels / f"{name}.json"
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise refused("file.missing", path) from None
-    except OSError as error:
-        raise unreadable(path, error) from None
+    data = read_file(path, LIMIT)
     if hashlib.sha256(data).hexdigest() != entry["label_sha256"]:
         raise refused("file.changed", path, what="manifest")
     return dict(json.loads(data))

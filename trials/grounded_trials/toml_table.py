@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from typing import Any
 from grounded.checks import near, refused, wrong
 from grounded.errors import GroundedError, NextCommand, alike
 from grounded.findings import found
-from grounded_trials.plain_file import open_file
+from grounded_trials.plain_file import read_file, unreadable
 
 SIZE_LIMIT = 2**22  # [bytes] of a file
 _REQUIRED = object()
@@ -154,28 +155,15 @@ def read_toml(path: Path) -> Table:
         GroundedError: if it does not exist, can't be read, or is not valid TOML (with line and
             column).
     """
-    import tomllib
-
-    try:
-        with open_file(path) as stream:
-            text = stream.read(SIZE_LIMIT + 1).decode("utf-8-sig")
-    except FileNotFoundError:
+    if not path.exists():
         near = sorted(str(one.parent) for one in path.parent.glob(f"*/{path.name}"))
         then = None if near else NextCommand("init", ("DIR", "--example", "car-turn"))
         here = near[0] if near else ""
-        raise GroundedError(found("file.no_workspace", str(path), near=here, then=then)) from None
-    except NotADirectoryError:
-        raise GroundedError(found("file.no_workspace", str(path.parent))) from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise GroundedError(found("file.unreadable", str(path), why=str(error))) from None
+        raise GroundedError(found("file.no_workspace", str(path), near=here, then=then))
     try:
-        if len(text) > SIZE_LIMIT:
-            raise ValueError(f"> {SIZE_LIMIT} bytes")
-        return Table(tomllib.loads(text), path)
+        return Table(tomllib.loads(read_file(path, SIZE_LIMIT).decode("utf-8-sig")), path)
     except (ValueError, RecursionError) as error:
-        raise GroundedError(
-            found("file.unreadable", path.name, why=str(error), kind="TOML file")
-        ) from None
+        raise unreadable(path.name, str(error), kind="TOML file") from None
 
 
 def key(name: str) -> str:
