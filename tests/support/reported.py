@@ -158,7 +158,6 @@ def many_flights(trials: int = 50) -> Findings:
             for run in runs
         ),
         logs=(),
-        others=0,
         lost=(),
         diagnosis=None,
         optimum=None,

@@ -84,7 +84,6 @@ class Findings:
     standing: Standing
     runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival; see `left_runs`
     logs: tuple[Log, ...]  # logs of this robot that ran no candidate; the latest of many
-    others: int  # stored trials of earlier tasks or other robots
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
     optimum: float | None  # of the real system, if a study computed it
@@ -193,15 +192,10 @@ class Findings:
         return None if best is None else self._mean(best.candidate.id)
 
     @cached_property
-    def latest(self) -> Run | None:
-        """The last run."""
-        return self.runs[-1] if self.runs else None
-
-    @cached_property
     def lately(self) -> Run | None:
         """The latest run of the best candidate, else the latest run; unlike `best`, no average."""
         best = self.best and self.runs_of(self.best.candidate.id)[-1]
-        return best or self.latest
+        return best or (self.runs[-1] if self.runs else None)
 
     @cached_property
     def improvements(self) -> tuple[Run, ...]:

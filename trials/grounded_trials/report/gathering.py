@@ -82,7 +82,6 @@ def gather(workspace: Folder) -> Findings:
         standing=now,
         runs=tuple(_runs(task, now, shown, better, lost)),
         logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
-        others=len(contents.trials) - len(own) - len(data),
         lost=tuple(lost),
         diagnosis=diagnosis,
         optimum=known_optimum(workspace.reports),
