@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from grounded_trials.starting.drawing import draw as _draw
     from grounded_trials.workspace.adoption import adopt_effects
     from grounded_trials.workspace.adoption import undo_adoption as _undo_adoption
-    from grounded_trials.workspace.candidates.exporting import Exported
+    from grounded_trials.workspace.candidates.exporting import export_in
     from grounded_trials.workspace.candidates.proposing import (
         propose_in,
         status_in,
@@ -147,6 +147,7 @@ class Workspace(Folder):
         adopt = adopt_effects
         undo_adoption = _undo_adoption
         report = report_in
+        export = export_in
         export_model = _export_model
         export_actuator = _export_actuator
         begin_with = _begin_with
@@ -169,6 +170,7 @@ class Workspace(Folder):
         adopt = _Method("workspace.adoption.adopt_effects", writes=True)
         undo_adoption = _Method("workspace.adoption.undo_adoption", writes=True)
         report = _Method("report.reporting.report_in")
+        export = _Method("workspace.candidates.exporting.export_in")
         export_model = _Method("workspace.home.taking_home.export_model")
         export_actuator = _Method("workspace.home.library.export_actuator")
         begin_with = _Method("workspace.home.library.begin_with")
@@ -228,32 +230,3 @@ class Workspace(Folder):
         path = replace_target(here.config, columns, here.base_model, terminal or {}, only_at_end)
         self.forget()
         return path
-
-    def export(
-        self,
-        candidate: str = "best",
-        path: str | Path | None = None,
-        *,
-        form: str | None = None,
-        runner: bool = False,
-        anyway: bool = False,
-    ) -> Exported:
-        """Export a candidate, or a trial, for other languages.
-
-        Candidates are refused as in `run`, except that one of an earlier task is allowed.
-
-        Args:
-            candidate: c0003, `best`, or a trial, t0007.
-            path: the file; None: named after the candidate, in the current folder.
-            form: csv, json or npz; of a trial csv or npz; None: by the file's suffix.
-            runner: write npz, and beside it the program that runs it on a robot with only numpy.
-            anyway: write it although it is void.
-        """
-        from grounded_trials.workspace.candidates.exporting import export_candidate
-
-        file, here, candidate = Path(path) if path else None, self.forget(), candidate.lower()
-        if candidate.startswith("t"):
-            from grounded_trials.report.run_file import export_run
-
-            return export_run(here, candidate, form, file, runner=runner)
-        return export_candidate(here, candidate, form, file, runner=runner, anyway=anyway)

@@ -163,7 +163,7 @@ def read_toml(path: Path) -> Table:
     try:
         return Table(tomllib.loads(read_file(path, SIZE_LIMIT).decode("utf-8-sig")), path)
     except (ValueError, RecursionError) as error:
-        raise unreadable(path.name, str(error), kind="TOML file") from None
+        raise unreadable(path, str(error), kind="TOML file") from None
 
 
 def key(name: str) -> str:

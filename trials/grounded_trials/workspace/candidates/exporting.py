@@ -40,6 +40,7 @@ from grounded_trials.workspace.candidates.search_state import (
     standing_in,
 )
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import unknown_candidate, unknown_trial
 
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
 OPEN_LOOP = "u_t = clip(feedforward_t, low, high)"  # no gain and no reference
@@ -206,6 +207,60 @@ class Exported(Document):
         return f"{self.candidate}: {self.file}"
 
 
+RUNS = ("csv", "npz")  # formats of a trial
+
+
+def export_in(
+    workspace: Folder,
+    candidate: str = "best",
+    path: str | Path | None = None,
+    *,
+    form: str | None = None,
+    runner: bool = False,
+    anyway: bool = False,
+) -> Exported:
+    """Export a candidate, or a trial, for other languages.
+
+    Candidates are refused as in `run`, except that one of an earlier task is allowed.
+
+    Args:
+        workspace: the workspace.
+        candidate: c0003, `best`, or a trial, t0007.
+        path: the file; None: named after the candidate, in the current folder.
+        form: csv, json or npz; of a trial csv or npz; None: by the file's suffix.
+        runner: write npz, and beside it the program that runs it on a robot with only numpy.
+        anyway: write it although it is void.
+    """
+    identity, file = candidate.lower(), Path(path) if path else None
+    if not identity.startswith("t"):
+        return export_candidate(workspace, identity, form, file, runner=runner, anyway=anyway)
+    if runner:
+        raise unknown_candidate(workspace, identity)
+    return _export_trial(workspace, identity, form, file)
+
+
+def _export_trial(
+    workspace: Folder, identity: str, form: str | None, path: Path | None
+) -> Exported:
+    """Write a trial as a table with a row for each state."""
+    form = form or format_of(path, RUNS, "csv")
+    one_of("the format of a run", form, RUNS)
+    path = path or Path(f"{identity}.{form}")
+    trial = next((one.trial for one in workspace.trials() if one.trial.id == identity), None)
+    if trial is None:
+        raise unknown_trial(workspace, identity)
+    last = np.full((1, trial.inputs.shape[1]), np.nan)  # the last state has no input
+    times = trial.dt * np.arange(len(trial.states))[:, None]
+    rows = np.hstack([times, trial.states, np.vstack([trial.inputs, last])])
+    names, stream = ("t", *trial.state_names, *trial.input_names), io.BytesIO()
+    if form == "npz":
+        np.savez(stream, **dict(zip(names, rows.T, strict=True)))
+    else:
+        np.savetxt(stream, rows, fmt="%.10g", delimiter=",", header=",".join(names), comments="")
+    write_atomically(path, stream.getvalue())
+    return Exported(identity, path, form)
+
+
 def export_candidate(
     workspace: Folder,
     identity: str,
@@ -215,7 +270,7 @@ def export_candidate(
     runner: bool = False,
     anyway: bool = False,
 ) -> Exported:
-    """Write a candidate to a file, see `Workspace.export`.
+    """Write a candidate to a file, see `export_in`.
 
     Without `form` the ending of `path` decides the format; without one it is npz with `runner`,
     else json.
