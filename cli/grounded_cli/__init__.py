@@ -2,5 +2,4 @@
 
 Read `main.py` first: it lists the commands with their files and turns errors into exit codes.
 `console/` has what they share: options, output of text, tables and progress, shell completion.
-`studies/` has the commands that need no robot.
 """

@@ -54,9 +54,9 @@ COMMANDS = {
     "recover": ("recover", "Recover what is readable in a damaged log."),
     "export": ("export", "Write a candidate for the robot: csv, npz or json."),
     "verify": ("status", "Check every stored file against its hash."),
-    "demo": ("studies.demo", "Run a whole example in a new folder: learn, diagnose, report."),
-    "experiment": ("studies.experiment", "Reproduce the paper's studies."),
-    "challenge": ("studies.challenge", "Make, diagnose and score blind cases for the diagnosis."),
+    "demo": ("demo", "Run a whole example in a new folder: learn, diagnose, report."),
+    "experiment": ("experiment", "Reproduce the paper's studies."),
+    "challenge": ("challenge", "Make, diagnose and score blind cases for the diagnosis."),
     "explain": ("explain", "Say what the code of a finding, or an effect, means."),
     "completion": ("console.completion", "Print the shell's completion script."),
 }

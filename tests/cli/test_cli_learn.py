@@ -18,7 +18,7 @@ def test_demo_prints_utilities_trials_and_the_optimum(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     there = find_spec  # no recording without rerun
     monkeypatch.setattr(
-        "grounded_cli.studies.demo.find_spec", lambda name: None if name == "rerun" else there(name)
+        "grounded_cli.demo.find_spec", lambda name: None if name == "rerun" else there(name)
     )
     done = grounded("demo", "pendulum", "--json")
     assert done.code == 0, done.err

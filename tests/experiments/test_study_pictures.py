@@ -14,7 +14,7 @@ from grounded.experiments.nondeterminism import EndPointSpread, NondeterminismRe
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded.figures.figure import Bars
 from grounded.figures.interactive import plotted
-from grounded_cli.studies.experiment import STUDIES
+from grounded_cli.experiment import STUDIES
 from grounded_trials.report.study_pictures import PICTURES, draw_study
 
 ANGLE = np.linspace(0, 2 * np.pi, 61)

@@ -52,7 +52,7 @@ def test_what_is_there_is_imported():
 @pytest.mark.parametrize(
     ("module", "never"),
     [
-        ("grounded_trials.report.page.page", ("grounded.diagnosis.likelihood", "grounded.effects")),
+        ("grounded_trials.report.page", ("grounded.diagnosis.likelihood", "grounded.effects")),
         (
             "grounded_trials.workspace.candidates.proposing",
             ("grounded.diagnosis", "grounded.search.improve"),

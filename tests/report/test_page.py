@@ -14,7 +14,7 @@ from grounded.diagnosis.parts import Diagnosis
 from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.page import page
+from grounded_trials.report.page import page
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.folder import Folder
 from pace import slowness

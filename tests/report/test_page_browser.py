@@ -13,7 +13,7 @@ from test_page import hostile
 from cli import grounded
 from grounded_trials.report.bodies import body_in
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.page import page
+from grounded_trials.report.page import page
 from grounded_trials.workspace.folder import Folder
 from page_browser import browser, missing
 from reported import car, cart, gathered

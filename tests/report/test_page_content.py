@@ -10,7 +10,7 @@ import pytest
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure
 from grounded_trials.report.findings import ESTIMATED, Log
-from grounded_trials.report.page.page import page
+from grounded_trials.report.page import page
 from grounded_trials.report.tables import forecast_table
 from reported import car, cart, gathered
 

@@ -12,7 +12,7 @@ from grounded_cli.console.terminal import sparkline, table
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.gathering import RUNAWAY
-from grounded_trials.report.page.page import page
+from grounded_trials.report.page import page
 from grounded_trials.report.report_text import report_text
 from reported import car, gathered
 

@@ -10,7 +10,7 @@ from facts import holds
 from grounded.search.pictures import few
 from grounded_trials import Workspace
 from grounded_trials.report import gathering
-from grounded_trials.report.page.page import page
+from grounded_trials.report.page import page
 from grounded_trials.store.trial_file import write_trial
 from reported import many_flights
 from workspaces import make

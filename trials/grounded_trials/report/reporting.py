@@ -18,7 +18,7 @@ from grounded_trials.report.figures.png import png as drawn
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
-from grounded_trials.report.page.page import page
+from grounded_trials.report.page import page
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered

@@ -1,7 +1,171 @@
-"""report.html: one self-contained page.
+"""report.html: one self-contained page that needs no network and runs only its own scripts.
 
-Read `page.py` first; its sections are those of `report.tables`.
-`page.html` is the template, `page.js` draws the figures with Plotly.
-`plotly-basic.min.js` is Plotly's smallest bundle, unchanged (npm: plotly.js-basic-dist-min 4.1.1,
-MIT). It is a quarter of the size of the bundle in the Python package, so that pages open fast.
+Read `page` first; its sections are those of `report.tables`. Names and texts from files are never
+markup: the template `page.html` escapes them, and a content security policy allows only the two
+scripts whose hashes the page states. The page holds the figures as data; `page.js` draws each with
+Plotly when it comes into view. `plotly-basic.min.js` is Plotly's smallest bundle, unchanged (npm:
+plotly.js-basic-dist-min 4.1.1, MIT). It is a quarter of the size of the bundle in the Python
+package, so that pages open fast.
 """
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import re
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from grounded.diagnosis.pictures import credit_figure
+from grounded.diagnosis.telling import FINDINGS, instrument_lines, sentence
+from grounded.errors import needs
+from grounded.figures.body import Motion
+from grounded.figures.figure import Bars, Panel, typeset
+from grounded.figures.interactive import label_lines, packed, palette, plotted
+from grounded_trials.report.findings import Findings
+from grounded_trials.report.tables import about, counted, improved, sections
+from grounded_trials.wording import glued, placed, rendered
+from grounded_trials.workspace.next_step import DIAGNOSE
+
+
+def page(findings: Findings) -> str:
+    """Return the HTML of the report.
+
+    Raises:
+        GroundedError: if Jinja2 is not installed.
+    """
+    needs("jinja2", "report")
+    from jinja2 import Environment
+
+    jinja = Environment(autoescape=True, finalize=typeset, trim_blocks=True, lstrip_blocks=True)
+    jinja.filters["glued"] = lambda text: _unbroken(placed(str(text), findings.folder))
+    jinja.filters["words"] = _words
+    scripts = [_own("plotly-basic.min.js"), _own("page.js")]
+    panels: list[dict[str, Any]] = []
+
+    def number(panel: Panel | Bars) -> int:
+        panels.append(_data(panel))
+        return len(panels) - 1
+
+    def data() -> str:  # called after all panels have been numbered
+        text = json.dumps({"panels": panels, "colours": palette()}, allow_nan=False)
+        return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
+
+    return jinja.from_string(_own("page.html")).render(
+        findings=findings,
+        about=about(findings),
+        tiles=counted(findings),
+        improved=improved(findings),
+        diagnose=rendered(DIAGNOSE, findings.folder),
+        why=_why(findings),
+        sections=sections(findings),
+        style=_own("page.css") + _roles(),
+        scripts=scripts,
+        hashes=[_hash(script) for script in scripts],
+        number=number,
+        height=_height,
+        data=data,
+    )
+
+
+def _unbroken(text: str) -> Any:
+    """Return markup in which no quantity (0.05 kg, 1e-05) is broken; text in ` becomes code."""
+    from markupsafe import Markup, escape
+
+    parts = str(text).split("`")
+    if len(parts) % 2 == 0:  # an unmatched backtick
+        parts = [str(text)]
+    for k, part in enumerate(parts):
+        if k % 2:
+            parts[k] = f"<code>{_words(part)}</code>"
+        else:
+            plain = re.sub(r"-(?=\d)|\|", "\\g<0>\u2060", glued(part))
+            parts[k] = str(escape(typeset(plain)))
+    return Markup("".join(parts))
+
+
+def _words(command: str) -> Any:
+    """Return markup in which a line is broken between the words of a command, not at hyphens."""
+    from markupsafe import Markup, escape
+
+    return Markup(" ".join(f"<span>{escape(word)}</span>" for word in command.split(" ")))
+
+
+@cache
+def _own(name: str) -> str:
+    return files(__package__).joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(script: str) -> str:
+    return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
+
+
+def _data(panel: Panel | Bars) -> dict[str, Any]:
+    kind = "bars" if isinstance(panel, Bars) else panel.kind
+    found: dict[str, Any] = _plain(plotted(panel))
+    if not isinstance(panel, Bars) and any(curve.motion for curve in panel.curves):
+        found["motions"] = [_motion(curve.motion) for curve in panel.curves]
+    return found | {"kind": kind}
+
+
+def _motion(motion: Motion | None) -> dict[str, Any] | None:
+    """Return a motion as data for the script: eight numbers over time for each part."""
+    if motion is None:
+        return None
+    rows = motion.poses.reshape(*motion.poses.shape[:2], 8)
+    parts = [
+        {
+            "strips": [strip.tolist() for strip in strips],
+            "thick": thick,
+            "pose": [packed(v) if np.ptp(v) else float(v[0]) for v in rows[:, k].T],
+        }
+        for k, (strips, thick) in enumerate(motion.wires)
+    ]
+    return {"t": packed(motion.times), "parts": parts}
+
+
+def _plain(value: Any) -> Any:
+    """Pack arrays, and convert NumPy numbers to Python's, in nested data."""
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return packed(value)
+    return float(value) if isinstance(value, np.floating) else typeset(value)
+
+
+def _height(panel: Panel | Bars) -> int:
+    """Return the height of a panel in the page [px]."""
+    if isinstance(panel, Bars):
+        return 30 + max(26, 16 * label_lines(panel)) * max(len(panel.bars), 1)
+    return 420 if panel.kind == "path" else 240
+
+
+def _roles() -> str:
+    """Return the style of the roles' colours, light and dark; print uses light."""
+    light = "".join(f".{role}{{--c:{pair[0]}}}" for role, pair in palette().items())
+    dark = "".join(f".{role}{{--c:{pair[1]}}}" for role, pair in palette().items())
+    return f"{light}@media screen and (prefers-color-scheme: dark){{{dark}}}"
+
+
+def _why(findings: Findings) -> dict[str, Any]:
+    """Return what is told of the diagnosis, and the credit figure; {} if undiagnosed."""
+    diagnosis, said = findings.diagnosis, findings.told
+    if diagnosis is None or said is None:
+        return {}
+    adopted = [] if findings.settled is None else findings.settled.rows
+    return {
+        "kind": diagnosis.kind,
+        "verdict": findings.lines,
+        "adopted": adopted if len(adopted) > 1 else [],
+        "causes": said.rows,
+        "header": said.header,
+        "preflight": instrument_lines(diagnosis.preflight),
+        "notes": [sentence(one) for one in said.findings[FINDINGS:]],
+        "credit": credit_figure(diagnosis, 2),
+    }
