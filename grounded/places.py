@@ -25,6 +25,7 @@ STRAIGHT = 1e-3  # error of velocities of about 1 from such a step
 MOVES_STATE = 1e-3  # part of what an input moves most below which it does not move a state
 SLOPE = 0.01  # tolerance of the factor 1 in q' = w
 SPEEDS = ("v", "speed", "velocity", "vx", "u")
+MODELS_KEPT = 64  # models of which is remembered what was found
 
 
 def role(model: Model, name: str) -> tuple[str, ...]:
@@ -195,25 +196,25 @@ def direct(model: Model) -> Model:
     Its states are the first ones of the model. What an input moves shows in its slopes: a delay, a
     dead zone or a saturation that was adopted would hide it.
     """
-    found = getattr(model.step, "direct", None)
-    if not isinstance(found, Model):
-        return model
-    return replace(found, params={name: model.params[name] for name in found.params})
+    while (around := getattr(model.step, "around", None)) is not None and around.of_inputs:
+        model = _within(model, around.inner)
+    return model
 
 
+@lru_cache(maxsize=MODELS_KEPT)
 def motion(model: Model) -> Model:
     """Return the model as written, without any adopted effect, with the current parameters.
 
     Which velocities move a position is a matter of its geometry: a drift over the ground or a late
     log that was adopted would hide it.
     """
-    while True:
-        shell, step = getattr(model.step, "shell", None), model.step
-        joined = getattr(step, "joined", None) or getattr(step, "losing", None)
-        inner = shell.effect.site.model if shell else joined[0] if joined else None
-        if inner is None:
-            return model
-        model = replace(inner, params={name: model.params[name] for name in inner.params})
+    while (around := getattr(model.step, "around", None)) is not None:
+        model = _within(model, around.inner)
+    return model
+
+
+def _within(model: Model, inner: Model) -> Model:
+    return replace(inner, params={name: model.params[name] for name in inner.params})
 
 
 def integrated(model: Model) -> dict[str, tuple[str, float]]:

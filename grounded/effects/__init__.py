@@ -3,10 +3,9 @@
 Read `family` first, which defines an effect, then any of the kinds: `actuator`, `joint`,
 `friction`, `rate`, `geometry`, `medium`, `sensor`. `grounded.places` finds where effects can act.
 `registry` has the `Library` of all families: it lists the effects that apply to a model and builds
-an effect from its name. `wrap` adds an effect to a model and returns a plain model again. `order`
-says in which order several effects are wrapped; `sensed` handles delayed logs beside true values. A
-new family is a value in one of these files, or comes from your own package by the entry point
-group `grounded.effects`.
+an effect from its name. `wrap` adds an effect to a model and returns a plain model again; `sensed`
+handles delayed logs beside true values. A new family is a value in one of these files, or comes
+from your own package by the entry point group `grounded.effects`.
 """
 
 from __future__ import annotations
@@ -26,11 +25,13 @@ from grounded.effects.family import (
     SensorFamily,
     SensorLagFamily,
     Site,
+    acting_order,
+    joining_order,
     scales_of,
+    wrapping_order,
 )
 from grounded.effects.joint import like_a_load, one_friction
 from grounded.effects.memory import memory_of, memory_start
-from grounded.effects.order import acting_order, wrapping_order
 from grounded.effects.plain_step import param_name
 from grounded.effects.registry import Library
 from grounded.effects.wrap import wrap
@@ -52,6 +53,7 @@ __all__ = [
     "SensorLagFamily",
     "Site",
     "acting_order",
+    "joining_order",
     "like_a_load",
     "memory_of",
     "memory_start",

@@ -35,17 +35,16 @@ from grounded.model import Model
 WHOLE = 0.02  # largest part of the accelerations' slopes that F W may leave unexplained
 SMALLEST_WEIGHT = 1e-3  # smallest weight of a velocity, relative to the largest
 MOST_VELOCITIES = 3  # velocities in a combination
-MODELS_KEPT = 64  # models whose drives are remembered
 
 
-@lru_cache(maxsize=MODELS_KEPT)
+@lru_cache(maxsize=places.MODELS_KEPT)
 def combined_speeds(model: Model) -> Mapping[str, Mapping[str, float]]:
     """Return the speeds of drives that are combinations: {input: {velocity: weight}}.
 
     The velocity with the largest weight is first, and has the weight 1. Drives of a single velocity
     are left out, and simulators with a step of their own.
     """
-    model = _bare(model)
+    model = places.motion(model)
     names = _velocities(model)
     if getattr(model.step, "timestep", 0.0) or len(names) < 2:
         return {}
@@ -88,20 +87,6 @@ def _slopes(model: Model, values: Array) -> tuple[Array, Array]:
     return f_u[:, at] / dt, slopes
 
 
-@lru_cache(maxsize=MODELS_KEPT)
-def _bare(model: Model) -> Model:
-    """Return the model inside all adopted effects, with the current parameters."""
-    found = model
-    while True:
-        shell = getattr(found.step, "shell", None)
-        inner = shell.effect.site.model if shell else found
-        for around in ("joined", "losing"):
-            inner = getattr(inner.step, around, (inner, ()))[0]
-        if inner is found:
-            return inner.with_values({name: model.params[name].value for name in inner.params})
-        found = inner
-
-
 def speed_weights(model: Model, target: str) -> Mapping[str, float]:
     """Return the velocities in the speed that a loss at `tau<-w` or `tau<-w+w2` depends on."""
     tau, _, w = target.partition("<-")
@@ -121,7 +106,7 @@ def weights_at(model: Model, target: str, given: Mapping[str, float]) -> Mapping
     found = speed_weights(model, target)
     if len(found) < 2:
         return found
-    inner = _bare(model)
+    inner = places.motion(model)
     values = np.array([given[name] for name in inner.param_names], float)
     row = inner.input_names.index(target.partition("<-")[0])
     with np.errstate(all="ignore"):
@@ -149,7 +134,7 @@ def speed(effect: Effect, values: Any, weights: Mapping[str, Any] | None = None)
     return total
 
 
-@lru_cache(maxsize=MODELS_KEPT)
+@lru_cache(maxsize=places.MODELS_KEPT)
 def push(model: Model, target: str) -> float:
     """Return the median acceleration of a drive, `tau<-w`, per unit of the input."""
     tau = target.partition("<-")[0]

@@ -25,7 +25,7 @@ A transport delay commutes with everything time-invariant, so it can act last. T
 a step interpolates two samples of what is delivered, not two commands that still pass through a
 nonlinear effect. Of two effects, the one wrapped LAST acts FIRST on a command. So wrapping goes
 from the model outwards: parameters, losses, limits of rates, rates, a medium, sensors (delayed ones
-last, delays before filters), inputs (`order`).
+last, delays before filters), inputs (`wrapping_order`).
 """
 
 from __future__ import annotations
@@ -406,6 +406,42 @@ class Effect:
         if missing:
             raise wrong(f"'{missing[0]}' of effect '{self.name}'", must="given")
         return MappingProxyType({name: whole[name] for name in names})
+
+
+INSIDE_OUT = (
+    *(ParamFamily, LossFamily, RateFamily, MediumFamily, SensorFamily),
+    *(SensorDelayFamily, SensorLagFamily),  # their memories start at the log
+)
+
+
+def acting_order(families: Sequence[Family]) -> list[int]:
+    """Return the indices of the effects on inputs in the order in which they act on a command."""
+    own = [i for i, f in enumerate(families) if isinstance(f, InputFamily | MemoryFamily)]
+    return sorted(own, key=lambda i: getattr(families[i], "transport", False))
+
+
+def joining_order(old: Sequence[Family], new: Sequence[Family]) -> list[tuple[bool, int]]:
+    """Return the order of old and new effects, as pairs (whether new, index).
+
+    New effects were fitted on the model with the old ones. On commands they act before the old
+    ones, otherwise after them.
+    """
+    first = sorted(acting_order(new))
+    last = [i for i in range(len(new)) if i not in first]
+    whole = [(first, True), (range(len(old)), False), (last, True)]
+    return [(late, i) for some, late in whole for i in some]
+
+
+def wrapping_order(families: Sequence[Family]) -> list[int]:
+    """Return the indices of all effects in wrapping order, the innermost first."""
+    inputs = acting_order(families)
+    rest = [i for i in range(len(families)) if i not in inputs]
+
+    def depth(i: int) -> tuple[int, bool]:  # limits of rates before rates
+        own = (k for k, kind in enumerate(INSIDE_OUT) if isinstance(families[i], kind))
+        return next(own, len(INSIDE_OUT)), not getattr(families[i], "parts", 0)
+
+    return [*sorted(rest, key=depth), *reversed(inputs)]
 
 
 def beyond(value: Any, most: Any) -> Any:

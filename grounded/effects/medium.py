@@ -45,6 +45,7 @@ from grounded.effects.family import (
     Values,
     two_axes,
 )
+from grounded.effects.plain_step import adopted
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import per_second
@@ -55,8 +56,7 @@ FELT = 1e-4  # [1/s^2] smallest change of a velocity's rate by a medium that mov
 
 def medium_of(model: Model) -> Effect | None:
     """Return the moving medium that was added to a model, or None."""
-    found = getattr(model.step, "medium", None)
-    return found if isinstance(found, Effect) else None
+    return next((e for e in adopted(model) if isinstance(e.family, MediumFamily)), None)
 
 
 def through_it(effect: Effect, s: Any, c: Any) -> Named:

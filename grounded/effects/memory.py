@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from grounded.compile.names import Named
+from grounded.effects.family import InputFamily, LossFamily, MemoryFamily, coupled
+from grounded.effects.plain_step import adopted, param_name, quantities_of
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import true_values
@@ -16,9 +18,24 @@ FOLLOWS = 0.4  # of what the model misses of a log in a step, by which the true 
 
 
 def settled(model: Model, a: Named, p: Named) -> dict[str, Any]:
-    """Return the settled memories under constant inputs a, by `input_family` or state."""
-    found = getattr(model.step, "settled", None)
-    return {} if found is None else dict(found(a, p))
+    """Return the settled memories under constant inputs a, by `input_family` or state.
+
+    Each effect passes its output on to those inside it.
+    """
+    found = dict[str, Any]()
+    for effect in adopted(model):
+        family, own = effect.family, {}
+        if isinstance(family, MemoryFamily):
+            own = {f"{n}_{family.name}": a[n] for n in effect.site.targets}
+        elif isinstance(family, InputFamily):
+            c = quantities_of(effect, p)
+            sent = {n: family.effect(a[n], 0.0, c) for n in effect.site.targets}
+            a = Named("input", tuple(a), [sent.get(n, a[n]) for n in a])
+        elif isinstance(family, LossFamily) and family.memory(effect.site):
+            rest = family.rest(a[coupled(effect.site)[0]], quantities_of(effect, p))
+            own = {param_name(effect.name, z): value for z, value in rest.items()}
+        found = own | found
+    return found
 
 
 def part_of(steps: Any) -> Any:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from grounded.compile.names import Named, check_names
-from grounded.effects.family import Effect
+from grounded.compile.problem import integrated
+from grounded.effects.family import Effect, Family, InputFamily, MemoryFamily, Values
 from grounded.model import Model
 
 Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
@@ -24,27 +26,58 @@ def plain_step(model: Model) -> Step:
         return lambda s, a, p, dt: checked(stepped, s, a, p, dt)
     assert derivative is not None
 
-    def moved(s: Any, rates: Mapping[str, Any], by: Any) -> Named:
-        return Named("state", names, [s[n] + by * rates[n] for n in names])
+    def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
+        def rate(at: list[Any]) -> list[Any]:
+            values = checked(derivative, Named("state", names, at), a, p)
+            return [values[n] for n in names]
 
-    def euler(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        return dict(moved(s, checked(derivative, s, a, p), dt))
+        start = [s[n] for n in names]
+        after = integrated(rate, start, dt, model.integrator, model.substeps)
+        return dict(zip(names, after, strict=True))
 
-    def rk4(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        k1 = checked(derivative, s, a, p)
-        k2 = derivative(moved(s, k1, 0.5 * dt), a, p)
-        k3 = derivative(moved(s, k2, 0.5 * dt), a, p)
-        k4 = derivative(moved(s, k3, dt), a, p)
-        return {n: s[n] + dt / 6 * (k1[n] + 2 * k2[n] + 2 * k3[n] + k4[n]) for n in names}
+    return step
 
-    once = rk4 if model.integrator == "rk4" else euler
 
-    def several(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        for _ in range(model.substeps):
-            s = Named("state", names, list(once(s, a, p, dt / model.substeps).values()))
-        return dict(s)
+@dataclass(frozen=True)
+class Around:
+    """What the step of a model with adopted effects is around.
 
-    return once if model.substeps == 1 else several
+    Args:
+        inner: the model without them.
+        effects: those that act together, several rates or several losses; else a single one.
+        values: quantities of the last one, as they were wrapped.
+        dt: control step [s].
+    """
+
+    inner: Model
+    effects: tuple[Effect, ...]
+    values: Values
+    dt: float
+
+    @property
+    def of_inputs(self) -> bool:
+        """Whether the effect acts on inputs."""
+        return isinstance(self.effects[-1].family, InputFamily | MemoryFamily)
+
+
+def around(model: Model) -> Around | None:
+    """Return the outermost adopted effects of a model, None if there are none."""
+    found = getattr(model.step, "around", None)
+    return found if isinstance(found, Around) else None
+
+
+def adopted(model: Model) -> Iterator[Effect]:
+    """Yield the adopted effects of a model, the outermost first."""
+    while (found := around(model)) is not None:
+        yield from reversed(found.effects)
+        model = found.inner
+
+
+def joined(model: Model, kind: type[Family]) -> tuple[Model, tuple[Effect, ...]]:
+    """Return the model inside its outermost effects if they are of a kind, and these effects."""
+    found = around(model)
+    same = found is not None and isinstance(found.effects[-1].family, kind)
+    return (found.inner, found.effects) if found is not None and same else (model, ())
 
 
 def param_name(effect: str, quantity: str) -> str:

@@ -24,8 +24,8 @@ has (`_inside`).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -49,11 +49,19 @@ from grounded.effects.family import (
     Site,
     Values,
     braked,
-    coupled,
 )
 from grounded.effects.losses import memory_name, remembered, step_with
-from grounded.effects.medium import medium_of, over_ground, through_it
-from grounded.effects.plain_step import Step, own_state, param_name, plain_step, quantities_of
+from grounded.effects.medium import over_ground, through_it
+from grounded.effects.plain_step import (
+    Around,
+    Step,
+    around,
+    joined,
+    own_state,
+    param_name,
+    plain_step,
+    quantities_of,
+)
 from grounded.effects.sensed import behind_logs, late_step, sensor_step
 from grounded.model import Model, Param
 from grounded.places import integrated, partner
@@ -75,9 +83,10 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     if isinstance(family, ParamFamily):
         name = effect.site.target
         return model.with_values({name: model.params[name].value + whole["d"]})
-    around = _shell(model)
-    if around and isinstance(family, LossFamily | MediumFamily | RateFamily):
-        return _inside(around, effect, values, dt)
+    outside = around(model)
+    moves = isinstance(family, LossFamily | MediumFamily | RateFamily)
+    if moves and outside and not isinstance(outside.effects[-1].family, LossFamily | RateFamily):
+        return _inside(outside, effect, values, dt)
     sized = any(whole[q.name] for q in effect.quantities if not q.fixed)
     added = {
         param_name(effect.name, q.name): _param(q, whole[q.name], sized) for q in effect.quantities
@@ -97,17 +106,11 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         raise unknown("effect that can be adopted", effect.name, ())
     step, memory = build(effect, whole, dt)
     vars(step)["timestep"] = getattr(model.step, "timestep", 0.0)
-    vars(step)["queued"] = getattr(family, "transport", False) or getattr(
-        model.step, "queued", False
-    )
-    vars(step)["settled"] = _settled(effect)
-    if not isinstance(family, LossFamily | RateFamily):
-        vars(step)["shell"] = _Shell(effect, whole, dt)
-    if isinstance(family, InputFamily | MemoryFamily) and (late := behind_logs(model)):
+    beside = joined(model, LossFamily if isinstance(family, LossFamily) else RateFamily)
+    inner, others = beside if isinstance(family, LossFamily | RateFamily) else (model, ())
+    vars(step)["around"] = outer = Around(inner, (*others, effect), whole, dt)
+    if outer.of_inputs and (late := behind_logs(model)):
         vars(step)["behind"] = late.lifted(model)
-    if isinstance(family, InputFamily | MemoryFamily):
-        vars(step)["direct"] = getattr(model.step, "direct", model)
-    vars(step)["medium"] = effect if isinstance(family, MediumFamily) else medium_of(model)
     written = model.step or model.derivative
     vars(step)["__wrapped__"] = getattr(written, "__wrapped__", written)  # `where`: the user's
     return Model(
@@ -139,32 +142,18 @@ def late_by(model: Model, late: Mapping[str, float], dt: float) -> Model:
     return wrap(Effect(one, Site(model, tuple(late), Scales()), each), dict(late), dt)
 
 
-@dataclass(frozen=True)
-class _Shell:
-    """The outermost effect of a model that does not act on the motion (input, sensor, medium)."""
-
-    effect: Effect
-    whole: Values
-    dt: float
-
-
-def _shell(model: Model) -> _Shell | None:
-    found = getattr(model.step, "shell", None)
-    return found if isinstance(found, _Shell) else None
-
-
-def _inside(around: _Shell, effect: Effect, values: Mapping[str, float], dt: float) -> Model:
+def _inside(outside: Around, effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     """Return a model with an effect on the motion inside its outermost effect.
 
     For example, a friction acts on the true velocity, not on its delayed log, and a hull's drag
     acts on the velocity through the water.
     """
-    model, outer = effect.site.model, around.effect
-    inner = outer.site.model
+    model, outer = effect.site.model, outside.effects[-1]
+    inner = outside.inner
     inner = replace(inner, params={name: model.params[name] for name in inner.params})
     grown = wrap(replace(effect, site=replace(effect.site, model=inner)), values, dt)
     again = replace(outer, site=replace(outer.site, model=grown))
-    whole = wrap(again, around.whole, around.dt)
+    whole = wrap(again, outside.values, outside.dt)
     params = {name: model.params.get(name, param) for name, param in whole.params.items()}
     name = f"{model.name} with {effect.name}"
     return replace(whole, params=params, name=name)
@@ -243,9 +232,8 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     base, depth, lead = plain_step(model), family.depth(whole, dt), family.lead
     # a rate limit's lead has kinks that would hinder plans, and changes its estimate by 1e-4
     positions = integrated(model) if lead is not None and family.linear else {}
-    inner = model  # without added rates and losses, which leads of inputs hardly change
-    for around in ("joined", "losing"):
-        inner = getattr(inner.step, around, (inner, ()))[0]
+    # without added rates and losses, which leads of inputs hardly change
+    inner, _ = joined(joined(model, RateFamily)[0], LossFamily)
     bare = plain_step(inner)
     names = {n: [f"{n}_{family.name}_{i + 1}" for i in range(depth)] for n in effect.site.targets}
 
@@ -269,34 +257,10 @@ def _memory_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[s
     return step, {z: model.inputs[n] for n, memory in names.items() for z in memory}
 
 
-def _settled(effect: Effect) -> Callable[[Any, Any], dict[str, Any]]:
-    """Return a function for the settled memories under constant commands, by name.
-
-    Each effect passes its output on to the effects that were wrapped before it.
-    """
-    model, family = effect.site.model, effect.family
-    inner = getattr(model.step, "settled", None)
-
-    def settled(a: Any, p: Any) -> dict[str, Any]:
-        own = {}
-        if isinstance(family, MemoryFamily):
-            own = {f"{n}_{family.name}": a[n] for n in effect.site.targets}
-        elif isinstance(family, InputFamily):
-            c = quantities_of(effect, p)
-            u = {n: family.effect(a[n], 0.0, c) for n in effect.site.targets}
-            a = _replaced(model, a, u)
-        elif isinstance(family, LossFamily) and family.memory(effect.site):
-            rest = family.rest(a[coupled(effect.site)[0]], quantities_of(effect, p))
-            own = {memory_name(effect, z): value for z, value in rest.items()}
-        return own if inner is None else {**inner(a, p), **own}
-
-    return settled
-
-
 def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     """Add a loss, solved together with those that the model already has."""
     model = effect.site.model
-    inner, others = getattr(model.step, "losing", (model, ()))
+    inner, others = joined(model, LossFamily)
     bare = getattr(inner.step, "bare", inner)
     bases, effects, moved = (
         [plain_step(inner), plain_step(bare)],
@@ -310,7 +274,6 @@ def _loss_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
         step, held = ((lambda u, base=base: base(start, u, p, dt)) for base in bases)
         return step_with(pairs, start, given, dt, (step, held), moved)
 
-    vars(step)["losing"] = (inner, effects)
     memory = _loss(effect).memory(effect.site)
     return step, {memory_name(effect, z): unit for z, unit in memory.items()}
 
@@ -329,11 +292,8 @@ def _loss(effect: Effect) -> LossFamily:
 def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str, str]]:
     """Add a rate or a limit to those that the model already has."""
     model = effect.site.model
-    inner, others = getattr(model.step, "joined", (model, ()))
-    effects = (*others, effect)
-    step = _joint_step(inner, effects)
-    vars(step)["joined"] = (inner, effects)
-    return step, dict.fromkeys(_clocks([effect]), "s")
+    inner, others = joined(model, RateFamily)
+    return _joint_step(inner, (*others, effect)), dict.fromkeys(_clocks([effect]), "s")
 
 
 def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
@@ -348,7 +308,7 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
     soft, dry = ([e for e in rates if _family(e).dry == one] for one in (False, True))
     needs_own = any(_family(e).needs_own for e in rates)
     tied = {n: k for n in model.state_names if (k := partner(model, n))}
-    losing = getattr(model.step, "losing", (model, ()))[1]
+    losing = joined(model, LossFamily)[1]
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
         start, now = own_state(model, s), {z: s[z] for z in clocks}

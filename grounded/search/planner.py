@@ -269,9 +269,8 @@ def planner_with(
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
     """
-    from grounded.effects import Library, param_name, wrap
+    from grounded.effects import Library, param_name, wrap, wrapping_order
     from grounded.effects.family import Effect, InputFamily, MemoryFamily, Scales, Site
-    from grounded.effects.order import wrapping_order
     from grounded.effects.wrap import late_by
 
     library, checked = library or Library(), checked or Effect.complete

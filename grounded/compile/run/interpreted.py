@@ -49,6 +49,7 @@ from grounded.compile.problem import (
     Samples,
     Swarm,
     System,
+    integrated,
 )
 from grounded.compile.trace.tracing import Signature
 from grounded.frozen import Array, wrapped
@@ -131,13 +132,11 @@ class Interpreted(System):
         with np.errstate(all="ignore"):
             if self.kind == "step":
                 return self.evaluate(x, u, p, dt, smoothing)
-            k1 = self.evaluate(x, u, p, dt, smoothing)
-            if self.integrator == "euler":
-                return np.asarray(x + dt * k1)
-            k2 = self.evaluate(x + 0.5 * dt * k1, u, p, dt, smoothing)
-            k3 = self.evaluate(x + 0.5 * dt * k2, u, p, dt, smoothing)
-            k4 = self.evaluate(x + dt * k3, u, p, dt, smoothing)
-            return np.asarray(x + dt / 6 * (k1 + 2 * k2 + 2 * k3 + k4))
+
+            def rate(at: list[Array]) -> list[Array]:
+                return [self.evaluate(at[0], u, p, dt, smoothing)]
+
+            return np.asarray(integrated(rate, [x], dt, self.integrator)[0])
 
     def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
         """See `System.rollout`."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from grounded.checks import refused
 from grounded.compile.names import Named, check_names, raised_at, wrong_value
-from grounded.compile.problem import STAGES, Integrator, Kind
+from grounded.compile.problem import Integrator, Kind, integrated
 from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
@@ -59,22 +59,13 @@ class Signature:
     def _integrated(self, x: list[Any], a: Named, p: Named, dt: Any) -> Mapping[str, Any]:
         """The next state by equal steps of Runge-Kutta or Euler within a control step."""
         assert self.within is not None
-        integrator, count = self.within
-        h = dt / count
 
         def rate(at: list[Any]) -> list[Any]:
             values = self.function(Named("state", self.states, at), a, p)
             check_names(values, self.states, self.function)
             return [values[name] for name in self.states]
 
-        for _ in range(count):
-            k: list[Any] = [0.0] * len(x)
-            moved = x
-            for c, b in STAGES[integrator]:
-                k = rate([xi + c * h * ki for xi, ki in zip(x, k, strict=True)])
-                moved = [m + b * h * ki for m, ki in zip(moved, k, strict=True)]
-            x = moved
-        return dict(zip(self.states, x, strict=True))
+        return dict(zip(self.states, integrated(rate, x, dt, *self.within), strict=True))
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,7 +57,7 @@ from grounded.effects.drive import weights_at
 from grounded.effects.family import braked, coupled
 from grounded.effects.losses import Left, Loads, ahead, loads, loads_from, solved
 from grounded.effects.medium import medium_of, through_it
-from grounded.effects.plain_step import quantities_of
+from grounded.effects.plain_step import adopted, quantities_of
 from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
 from grounded.engine import SentOnce
 from grounded.frozen import Array
@@ -143,7 +143,7 @@ class Predictor(SentOnce):
         outright: those would show the last part alone.
         """
         model = self.data.model
-        queued = getattr(model.step, "queued", False)
+        queued = any(getattr(effect.family, "transport", False) for effect in adopted(model))
         return not (simulated(model) or queued or outright_states(model))
 
     def begun(self, h: Hypothesis) -> Array | None:

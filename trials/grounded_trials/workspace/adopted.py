@@ -15,7 +15,7 @@ from functools import partial
 from typing import Any
 
 from grounded.checks import of_type, wrong
-from grounded.effects import param_name
+from grounded.effects import joining_order, param_name
 from grounded.effects.family import (
     Effect,
     Family,
@@ -25,7 +25,6 @@ from grounded.effects.family import (
     SensorLagFamily,
     Site,
 )
-from grounded.effects.order import joining_order
 from grounded.effects.registry import Library
 from grounded.errors import GroundedError
 from grounded.search.planner import Planner, planner_with
