@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -75,8 +76,7 @@ def of_a_kind(model: Model) -> tuple[tuple[str, ...], ...]:
     if model.m < 2:
         return ()
     bare = direct(model)
-    _, f_u = bare.system.linearise(*samples(bare, 8), bare.values, probe(bare, INSTANT_S))
-    by, units = np.abs(f_u).max(axis=0), list(bare.states.values())
+    by, units = np.abs(slopes(bare, INSTANT_S).u).max(axis=0), list(bare.states.values())
     kinds: dict[tuple[str, ...], list[str]] = {}
     for j, name in enumerate(model.input_names):
         moved = {units[i] for i in np.flatnonzero(by[:, j] > MOVES_STATE * by[:, j].max())}
@@ -98,10 +98,9 @@ def steering(model: Model) -> list[str]:
     turned = heading(model)
     if turned is None:
         return []
-    i, dt = model.state_names.index(turned), probe(model, 1e-5)
-    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)
-    size = {n: float(np.abs(f_x[:, i, j]).max()) for j, n in enumerate(model.state_names)}
-    size |= {n: float(np.abs(f_u[:, i, j]).max()) for j, n in enumerate(model.input_names)}
+    f_x, f_u, dt = slopes(model, INSTANT_S)
+    by = np.abs(np.concatenate([f_x, f_u], axis=2)).max(axis=0)[model.state_names.index(turned)]
+    size = dict(zip((*model.state_names, *model.input_names), by.tolist(), strict=True))
     no = {*position(model), turned, speed(model), speed_input(model), *role(model, "heading_rate")}
     return [n for n, by in size.items() if n not in no and by > 1e-3 * dt]
 
@@ -159,9 +158,8 @@ def crossed(model: Model) -> list[str]:
 
     An input that acts on a state through others in between (a servo) does not drive it at once.
     """
-    dt, (x, u) = probe(model, INSTANT_S), samples(model, 8)
-    size = np.abs(model.system.linearise(x, u, model.values, dt)[1]).max(axis=0)
-    acts = dict(zip(model.state_names, size > 1e-3 * dt, strict=True))
+    _, f_u, dt = slopes(model, INSTANT_S)
+    acts = dict(zip(model.state_names, np.abs(f_u).max(axis=0) > 1e-3 * dt, strict=True))
     driven = [name for name in dynamic(model) if acts[name].any()]
     return [
         f"{name}<-{a}"
@@ -188,6 +186,21 @@ def probe(model: Model, dt: float) -> float:
     """Return a step for probing a model [s]: dt, or the nearest that its simulator supports."""
     own = float(getattr(model.step, "timestep", 0.0))
     return max(1, round(dt / own)) * own if own else dt
+
+
+class Slopes(NamedTuple):
+    """Slopes of a step of dt [s] at random states and inputs (`samples`): (S, n, n), (S, n, m)."""
+
+    x: Array
+    u: Array
+    dt: float
+
+
+@lru_cache(maxsize=MODELS_KEPT)
+def slopes(model: Model, step: float = 1e-2) -> Slopes:
+    """Return the slopes of a model's step of about so many seconds (`probe`)."""
+    dt = probe(model, step)
+    return Slopes(*model.system.linearise(*samples(model, 8), model.values, dt), dt)
 
 
 def direct(model: Model) -> Model:
@@ -259,8 +272,8 @@ def only_read(model: Model) -> dict[str, str]:
     pairs = integrated(model)
     if not pairs:
         return {}
-    f_x, _ = model.system.linearise(*samples(model, 8), model.values, probe(model, 1e-2))
-    felt = np.abs(f_x - np.eye(model.n)).max(axis=0).max(axis=0)  # by any state, itself included
+    change = slopes(model).x - np.eye(model.n)
+    felt = np.abs(change).max(axis=0).max(axis=0)  # by any state, itself included
     free = {name for name, size in zip(model.state_names, felt, strict=True) if size < 1e-9}
     return {name: rate for name, (rate, _) in pairs.items() if name in free}
 
@@ -271,8 +284,7 @@ def levelled(model: Model) -> list[str]:
     A balance's angle acts on its own, a beam's on that of the ball. Gravity or a spring that acts
     about another angle than the model's then looks in every log like a sensor with another zero.
     """
-    dt, found = probe(model, 1e-6), []
-    f_x, _ = model.system.linearise(*samples(model, 8), model.values, dt)
+    (f_x, _, dt), found = slopes(model, 1e-6), []
     felt = (np.abs(f_x - np.eye(model.n)) / dt).max(axis=0)
     places = integrated(model)
     rates = [model.state_names.index(rate) for rate, _ in places.values()]
@@ -328,10 +340,9 @@ def told_by(model: Model, pair: Sequence[str]) -> set[str]:
     the pair is equivalent to a delay of its inputs.
     """
     names = (*model.state_names, *model.input_names)
-    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, probe(model, 1e-2))
-    slopes = np.abs(np.concatenate([f_x, f_u], axis=2)).max(axis=0)
+    by = np.abs(np.concatenate(slopes(model)[:2], axis=2)).max(axis=0)
     tied = np.zeros((len(names), len(names)), bool)
-    tied[: model.n] = np.nan_to_num(slopes) > 1e-9
+    tied[: model.n] = np.nan_to_num(by) > 1e-9
     tied |= tied.T | np.eye(len(names), dtype=bool)
     found = np.isin(names, pair)
     for _ in names:
@@ -350,9 +361,7 @@ def following(model: Model) -> list[str]:
 
     Their rate depends on an input, on no other state, and somewhere decreases with them.
     """
-    dt = probe(model, 1e-2)
-    f_x, f_u = model.system.linearise(*samples(model, 8), model.values, dt)
-    found = []
+    (f_x, f_u, _), found = slopes(model), []
     for i, name in enumerate(model.state_names):
         driven = np.abs(f_u[:, i]).max() > 1e-6
         alone = np.abs(np.delete(f_x[:, i], i, axis=1)).max(initial=0.0) < 1e-6
@@ -370,16 +379,14 @@ def derived_states(model: Model) -> set[str]:
     named = role(model, "heading_rate")
     if not named:
         return set()
-    f_x, _ = model.system.linearise(*samples(model), model.values, probe(model, 0.01))
     i = model.state_names.index(named[0])
-    others = np.delete(f_x[:, :, i], i, axis=1)
+    others = np.delete(slopes(model).x[:, :, i], i, axis=1)
     return {named[0]} if float(np.abs(others).max()) < 1e-12 else set()
 
 
 def outright_states(model: Model) -> set[str]:
     """Return states that the model sets regardless of their previous value, without dynamics."""
-    f_x, _ = model.system.linearise(*samples(model), model.values, probe(model, 0.01))
-    own = np.abs(f_x[:, np.arange(model.n), np.arange(model.n)]).max(axis=0)
+    own = np.abs(np.diagonal(slopes(model).x, axis1=1, axis2=2)).max(axis=0)
     return {name for name, size in zip(model.state_names, own, strict=True) if size < 1e-9}
 
 

@@ -138,9 +138,8 @@ def speed(effect: Effect, values: Any, weights: Mapping[str, Any] | None = None)
 def push(model: Model, target: str) -> float:
     """Return the median acceleration of a drive, `tau<-w`, per unit of the input."""
     tau = target.partition("<-")[0]
-    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
-    by = model.system.linearise(x, u, model.values, dt)[1][..., model.input_names.index(tau)]
-    weights = speed_weights(model, target)
+    _, f_u, dt = places.slopes(model, places.INSTANT_S)
+    by, weights = f_u[..., model.input_names.index(tau)], speed_weights(model, target)
     total = sum(k * by[:, model.state_names.index(name)] for name, k in weights.items())
     return float(np.median(total)) / dt
 

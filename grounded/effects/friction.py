@@ -34,8 +34,7 @@ def _least(site: Site, power: int) -> float:
     model, name = site.model, site.target
     if not site.scales.moves(name):
         return -np.inf
-    i, dt = model.state_names.index(name), places.probe(model, 1e-5)
-    f_x, _ = model.system.linearise(*places.samples(model, 8), model.values, dt)
+    i, (f_x, _, dt) = model.state_names.index(name), places.slopes(model, places.INSTANT_S)
     damping = float(np.median(1 - f_x[:, i, i])) / dt
     return -max(damping, 0.0) * site.scales.peak(name) ** (1 - power)
 

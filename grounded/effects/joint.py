@@ -98,10 +98,9 @@ def pairs_of(model: Model) -> list[str]:
     if own and not efforts:
         efforts = list(model.input_names)
     velocities = places.velocities(model)
-    dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
     found = {}
     if efforts and velocities:
-        _, f_u = model.system.linearise(x, u, model.values, dt)
+        f_u = places.slopes(model).u
         found = {tau: _pushed(model, f_u, tau, velocities) for tau in efforts}
     if not own and len(found) < model.m:
         found |= _coupled(model, [n for n in model.input_names if n not in found])
@@ -173,8 +172,7 @@ def _loaded(site: Site) -> tuple[Quantity, ...]:
 
 def alone(model: Model, tau: str, w: str) -> bool:
     """Check whether tau moves only w, through a constant inertia."""
-    dt, (x, u) = places.probe(model, 1e-5), places.samples(model, 8)
-    _, f_u = model.system.linearise(x, u, model.values, dt)
+    f_u = places.slopes(model, places.INSTANT_S).u
     by, i = f_u[:, :, model.input_names.index(tau)], model.state_names.index(w)
     others = np.abs(np.delete(by, i, axis=1)).max(initial=0.0)
     return bool(others < ONLY * by[0, i] and np.ptp(by[:, i]) < ONLY * by[0, i])
