@@ -72,11 +72,6 @@ class Drive:
         return tuple(name for name, share in self.left.items() if share > WEAK)
 
 
-def uncertain(task: Task) -> tuple[str, ...]:
-    """Return the names of the model's uncertain parameters."""
-    return tuple(name for name, one in task.model.params.items() if one.uncertain)
-
-
 def design(task: Task, steps: int, noise: Array, hidden: tuple[str, ...] = ()) -> Drive | None:
     """Find the drive of a length that tells most of the uncertain parameters.
 
@@ -99,40 +94,18 @@ def design(task: Task, steps: int, noise: Array, hidden: tuple[str, ...] = ()) -
     moved = np.median([np.ptp(run.states, axis=0) for *_, run in drives], axis=0)
     unseen = [task.model.state_names.index(name) for name in hidden]
     known = _known_noise(noise, moved, unseen, hidden)
-    best = None
+    h, best = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0), None
     for pattern, cycles, size, policy, run in drives:
-        whole = _precision(task, [run], known)
-        if whole.shape != 2 * (len(uncertain(task)),) or not np.isfinite(whole).all():
+        F = information(task, [run], h, known)
+        whole = F + np.eye(len(F))  # in units of the parameters' priors
+        if whole.shape != 2 * (len(task.model.uncertain),) or not np.isfinite(whole).all():
             continue
         nats = 0.5 * float(np.linalg.slogdet(whole)[1])
         if best is None or nats > best.nats:
-            best = Drive(policy, run, pattern, cycles, size, _left(task, whole), nats)
+            shares = np.sqrt(np.diag(np.linalg.inv(whole))).tolist()
+            left = dict(zip(task.model.uncertain, shares, strict=True))
+            best = Drive(policy, run, pattern, cycles, size, left, nats)
     return best
-
-
-def told_by(task: Task, runs: Sequence[Trial], noise: Array) -> dict[str, float]:
-    """Return what runs leave of each uncertain parameter's standard deviation, as `Drive.left`.
-
-    Args:
-        task: model, start, latency.
-        runs: runs of the model, without noise.
-        noise: standard deviation of a sample of each state's sensor, (n,).
-    """
-    known = _known_noise(noise, np.ones(task.model.n), (), ())
-    return _left(task, _precision(task, runs, known))
-
-
-def _precision(task: Task, runs: Sequence[Trial], known: KnownNoise) -> Array:
-    """Return I + F of runs, in units of the parameters' priors."""
-    h = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0)
-    F = information(task, runs, h, known)
-    return np.asarray(F + np.eye(len(F)))
-
-
-def _left(task: Task, precision: Array) -> dict[str, float]:
-    """Return `Drive.left`."""
-    left = np.sqrt(np.diag(np.linalg.inv(precision)))
-    return dict(zip(uncertain(task), left.tolist(), strict=True))
 
 
 def _of_length(task: Task, steps: int) -> Task:

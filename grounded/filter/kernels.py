@@ -2,27 +2,30 @@
 
 A run's covariance is a few dozen numbers: NumPy spends its time on calls. In `gains` and `smoother`
 W runs lie side by side in the lanes of a vector (the last one repeated to fill them), in
-`innovations` W columns do; `lanes` writes their matrices.
+`innovations` W columns do. Matrices of vectors of W lanes are [entry][lane]; rows are a loop, the
+entries of a row are unrolled as long as the text stays short.
 """
 
 from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from grounded.compile.emit.llvm_text import declarations, splat
+from grounded.compile.emit.llvm_batch import Words
+from grounded.compile.emit.llvm_text import Writer, declarations, splat
 from grounded.compile.run import jit
 from grounded.compile.run.arguments import call
-from grounded.filter.lanes import Pass
 
 LARGEST = 16  # channels; beyond, NumPy
 WIDEST = 48  # states
+UNROLLED = 12  # entries of a row
+INTEGERS = ("L", "B", "blocks")
 _LOCK = threading.Lock()
 NAMES = {
     "gains": ("A", "Q", "R", "seen", "start", "G", "L", "B", "k", "weight", "P"),
@@ -93,12 +96,146 @@ def _made(n: int, N: int, through: bool) -> jit.Library:
 
 @cache
 def _version() -> str:
-    files = (Path(__file__).with_name(name) for name in ("kernels.py", "lanes.py"))
-    text = b"".join(file.read_bytes() for file in files)
-    return hashlib.sha256(text).hexdigest()[:16] + jit.writers()
+    return hashlib.sha256(Path(__file__).read_bytes()).hexdigest()[:16] + jit.writers()
 
 
-class _Gains(Pass):
+class _Pass:
+    """A pass of the filter being written, for n channels and N states.
+
+    Args:
+        names: of the words that it is called with.
+        n: channels.
+        N: states.
+        width: W.
+        through: whether disturbances enter through G.
+    """
+
+    name: str
+
+    def __init__(self, names: Sequence[str], n: int, N: int, width: int, through: bool) -> None:
+        self.f = Writer(f"i64 @{self.name}(ptr %words)")
+        words = Words(self.f, names)
+        self.base = {w: words.pointer(w) for w in names if w not in INTEGERS}
+        self.count = {w: words.integer(w) for w in names if w in INTEGERS}
+        self.L, self.B = self.count["L"], self.count["B"]
+        self.n, self.N, self.W, self.through = n, N, width, through
+        self.runs: list[str] = []
+
+    def text(self) -> str:
+        """The finished kernel."""
+        self.write()
+        self.f.do("ret i64 0")
+        return self.f.text()
+
+    def write(self) -> None:
+        """Its body."""
+        raise NotImplementedError
+
+    def room(self, size: int) -> str:
+        """Vectors of W lanes on the stack."""
+        return self.f.room(size * self.W)
+
+    def load(self, base: str, index: int = 0) -> str:
+        """Vector `index` of a matrix."""
+        return self.f.load(base, index * self.W, self.W)
+
+    def store(self, value: str, base: str, index: int = 0) -> None:
+        """The way back."""
+        self.f.store(value, base, index * self.W, self.W)
+
+    def all(self, base: str, size: int, step: int = 1) -> list[str]:
+        """Every `step`-th vector, `size` of them."""
+        return [self.load(base, i * step) for i in range(size)]
+
+    def at(self, base: str, index: int | str, size: int = 1) -> str:
+        """The address of entry `index` of blocks of `size` vectors."""
+        if isinstance(index, int):
+            return self.f.at(base, index * size * self.W)
+        return self.f.at(base, self.f.integer("mul", index, size * self.W))
+
+    def each(self, size: int) -> Iterator[int | str]:
+        """Entries of a row: unrolled if they are few, else a loop."""
+        if size <= UNROLLED:
+            yield from range(size)
+            return
+        with self.f.loop(size) as i:
+            yield i
+
+    def dot(self, a: list[str], b: list[str], start: str | None = None) -> str:
+        """The sum of products, added to `start`."""
+        total = self.f.mul(a[0], b[0], self.W) if start is None else start
+        for x, y in list(zip(a, b, strict=True))[start is None :]:
+            total = self.f.fma(x, y, total, self.W)
+        return total
+
+    def clear(self, base: str, size: int) -> None:
+        """Sets vectors to zero."""
+        with self.f.loop(size) as i:
+            self.store(splat(0.0, self.W), self.at(base, i))
+
+    def groups(self) -> Iterator[None]:
+        """W runs at a time; the last one is repeated to fill the lanes."""
+        f, last = self.f, self.f.integer("sub", self.B, 1)
+        count = f.integer("sdiv", f.integer("add", self.B, self.W - 1), self.W)
+        with f.loop(count) as group:
+            first, self.runs = f.integer("mul", group, self.W), []
+            for lane in range(self.W):
+                i = f.integer("add", first, lane)
+                self.runs.append(f.pick(f.compare_integers("sgt", i, last), last, i))
+            yield
+
+    def _places(self, name: str, t: str, size: int) -> list[str]:
+        row = self.f.integer("mul", t, self.B)
+        places = (self.f.integer("add", row, run) for run in self.runs)
+        return [self.f.at(self.base[name], self.f.integer("mul", p, size)) for p in places]
+
+    def gather(self, name: str, t: str, size: int, to: str) -> None:
+        """Row t of an array (time, run, size) of the group's runs into lanes."""
+        places, f = self._places(name, t, size), self.f
+        with f.loop(size) as i:
+            value = "poison"
+            for lane, place in enumerate(places):
+                one = f.load(f.at(place, i))
+                value = f.emit(
+                    f"insertelement <{self.W} x double> {value}, double {one}, i64 {lane}"
+                )
+            self.store(value, self.at(to, i))
+
+    def scatter(self, source: str, name: str, t: str, size: int, *, step: int = 1) -> None:
+        """The way back; every `step`-th vector of the source."""
+        places, f = self._places(name, t, size), self.f
+        with f.loop(size) as i:
+            value = self.load(self.at(source, i, step))
+            for lane, place in enumerate(places):
+                f.store(f.lane(value, lane, self.W), f.at(place, i))
+
+    def wanted(self, name: str) -> str:
+        """Whether an output that may be missing is there."""
+        return self.f.given(self.base[name])
+
+    def sandwich(self, A: str, P: str, spare: str, *, transposed: bool) -> None:
+        """P <- A P A', or A' P A, the mean of what stands above and below the diagonal."""
+        f, N = self.f, self.N
+        row, step = (1, N) if transposed else (N, 1)
+        with f.loop(N) as line:
+            values, to = self.all(self.at(A, line, row), N, step), self.at(spare, line, N)
+            for j in self.each(N):
+                self.store(self.dot(values, self.all(self.at(P, j), N, N)), self.at(to, j))
+        with f.loop(N) as line:
+            values, to = self.all(self.at(spare, line, N), N), self.at(P, line, N)
+            for j in self.each(N):
+                other = self.all(self.at(A, j, row), N, step)
+                self.store(self.dot(values, other), self.at(to, j))
+        for i in range(1, N):  # what is not symmetric would grow, step by step
+            for j in range(i):
+                below, above = i * N + j, j * N + i
+                mean = f.add(self.load(P, below), self.load(P, above), self.W)
+                mean = f.mul(mean, splat(0.5, self.W), self.W)
+                self.store(mean, P, below)
+                self.store(mean, P, above)
+
+
+class _Gains(_Pass):
     name = "gains"
 
     def write(self) -> None:
@@ -156,7 +293,7 @@ class _Gains(Pass):
                 self.store(f.fma(down, other, self.load(place), W), place)
 
 
-class _Innovations(Pass):
+class _Innovations(_Pass):
     """All runs go through time together, so that memory is read in order."""
 
     name = "innovations"
@@ -203,7 +340,7 @@ class _Innovations(Pass):
         return [f.at(place, f.integer("mul", columns, i)) for i in range(rows)]
 
 
-class _Smoother(Pass):
+class _Smoother(_Pass):
     name = "smoother"
 
     def write(self) -> None:

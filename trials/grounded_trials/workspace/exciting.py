@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from grounded.checks import wrong
-from grounded.diagnosis.design import Drive, design, uncertain
+from grounded.diagnosis.design import Drive, design
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
@@ -120,7 +120,7 @@ def _bounded(workspace: Folder) -> Task:
     """Return the task at rest, its states bounded by [safety] or by where logs have been."""
     planner = workspace.planner
     task = planner.plan.with_model(_as_known(workspace, planner.plan.model))
-    if not uncertain(task):
+    if not task.model.uncertain:
         raise GroundedError(found("given.constant", str(workspace.config.model.file)))
     ends = zip(task.model.input_names, task.low, task.high, strict=True)
     if free := [name for name, *both in ends if not np.isfinite(both).all()]:
