@@ -42,9 +42,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     errors = diagnosis.prediction_error
     if not errors:
         return None
-    apart = any(not e.whole_trial for e in errors) and len(errors) > 1
-    columns = columns_told(diagnosis)
-    panels = _over_horizons(errors, columns) if apart else _by_channel(errors[0], columns)
+    panels = _over_horizons(errors, columns_told(diagnosis))
     if not panels:
         return None
     caption = "" if errors[0].held_out != "no" else "not held out"
@@ -52,12 +50,12 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
 
 
-def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> list[Panel | Bars]:
+def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> list[Panel]:
     """Return one panel per state: its error over the horizon, and apart, that of whole trials."""
     units = errors[0].unit_by_channel
-    panels: list[Panel | Bars] = []
-    ahead = np.array([e.horizon_s for e in errors if not e.whole_trial])
-    at = np.array([APART_BY * ahead.max() if e.whole_trial else e.horizon_s for e in errors])
+    panels: list[Panel] = []
+    apart = APART_BY * max((e.horizon_s for e in errors if not e.whole_trial), default=1.0)
+    at = np.array([apart if e.whole_trial else e.horizon_s for e in errors])
     whole = np.array([e.whole_trial for e in errors])
     ticks = [
         (float(x), WHOLE.replace(" ", "\n") if w else f"{x:.3g}")
@@ -78,20 +76,6 @@ def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> li
             unit = shown(unit)
             label, across = f"{channel} [{unit}]" if unit else channel, "predicted ahead [s]"
             panels.append(Panel(label, across, unit, tuple(curves), log=True, x_ticks=tuple(ticks)))
-    return panels
-
-
-def _by_channel(error: RulerRow, columns: Mapping[str, str]) -> list[Panel | Bars]:
-    panels: list[Panel | Bars] = []
-    for channel, unit in error.unit_by_channel.items():
-        bars = []
-        for key, name in columns.items():
-            value = getattr(error, key).get(channel, math.nan)
-            if math.isfinite(value):
-                bars.append((name, value, ROLES[key]))
-        if bars:
-            when = WHOLE if error.whole_trial else f"{error.horizon_s:.3g} s ahead"
-            panels.append(Bars(f"{channel}, {when}", _in_unit(bars, unit)))
     return panels
 
 

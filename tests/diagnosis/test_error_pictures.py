@@ -21,5 +21,5 @@ def test_the_error_over_whole_trials_is_no_error_at_a_horizon():
     assert "whole trial" in drawn["data"][1]["hovertemplate"]
     assert drawn["layout"]["xaxis"]["ticktext"][-1] == "whole<br>trial"
     assert drawn["layout"]["xaxis"]["ticklabeloverflow"] == "allow"  # it was hidden at the edge
-    (bars,) = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows[2:])).panels
-    assert bars.title == "x, whole trial"
+    (alone,) = accuracy_figure(Diagnosis(Verdict("none"), prediction_error=rows[2:])).panels
+    assert [label for _, label in alone.x_ticks] == ["whole\ntrial"] and len(alone.curves) == 1
