@@ -83,7 +83,8 @@ class Writer:
         self.predictor, self.data = self.search.predictor, self.search.data
         self.shown = list(zip(ruler.shown, ruler.names, strict=True))
         self.measured = Measured(decision, ruler, self.trials, sound.first, sound.exact)
-        self.claims = Claims(decision, self.measured.credit, self.known, ruler, uncertain)
+        credit = {one.of: one.share for one in self.measured.credits}
+        self.claims = Claims(decision, credit, self.known, ruler, uncertain)
         self.left = self.measured.left
 
     def diagnosis(self, apart: tuple[Changed, ...] | None = None) -> Diagnosis:
@@ -101,7 +102,7 @@ class Writer:
         alike = self.claims.nearly(groups)
         measured = self.measured
         remainder = measured.remainders()
-        rows, credit = measured.prediction_error(), measured.credits()
+        rows, credit = measured.prediction_error(), measured.credits
         named = [row.effect for row in ranking if row.claimed]
         located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
         if remainder and not named:  # what is left elsewhere is no gap

@@ -32,7 +32,7 @@ from grounded.diagnosis.validation.certainty import (
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.identifiable import Identified, identified
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
-from grounded.diagnosis.validation.measured import Measured, ordered
+from grounded.diagnosis.validation.measured import Measured
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
 from grounded.frozen import Array
@@ -108,7 +108,8 @@ class Claims:
             return Ranked(name, params, fixed, evidence, gap, shrinkage, claimed)
 
         before = measured.gap(measured.decision.crude)
-        rows = [row(self.best, n, self.lost[n]) for n in ordered(self.credit, self.names)]
+        best_first = sorted(self.names, key=lambda name: -self.credit.get(name, 0.0))
+        rows = [row(self.best, n, self.lost[n]) for n in best_first]
         rows += [row(self.best, *one) for one in self.off()]
         listed = {one.effect for one in rows}
         tied = {n: one for n, one in self.tied().items() if n not in listed}

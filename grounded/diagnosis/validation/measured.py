@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -66,8 +66,6 @@ class Measured:
         self.search, self.best = decision.search, decision.fit
         self.predictor, self.data = self.search.predictor, self.search.data
         self.units = {n: self.data.model.states[n] for n in ruler.names}
-        self.lost = losses(ruler, decision)
-        self.credit = credited(ruler, decision, self.lost)
         self.left, self.flexible = decision.left, decision.flexible
         self.whiteness = self.white()
         told = [p for n, p in self.whiteness.items() if n not in self.data.between]
@@ -152,8 +150,9 @@ class Measured:
         return {n: float(found[i]) for i, n in zip(self.ruler.shown, self.units, strict=True)}
 
     def gap(self, fit: Fitted) -> float:
-        """Return the gap that a fit leaves, relative to the noise of the decision."""
-        return gap_of(self.ruler, fit, self.carried)
+        """Return the gap that a fit leaves at the longest horizon, relative to the noise alone."""
+        relative = (self.ruler.errors(fit).rms / self.carried)[len(self.ruler.steps) - 1]
+        return float(np.sqrt(np.nanmean(relative[self.ruler.shown] ** 2)))
 
     def prediction_error(self) -> tuple[RulerRow, ...]:
         """Return the table of prediction errors at 0.1, 0.5, 1 s and over the whole trial."""
@@ -213,24 +212,23 @@ class Measured:
         rows = [(k, steps[k] * dt) for k in range(first, len(steps))]
         return [*rows, (len(steps), float(np.median(self.data.lengths)) * dt)]
 
+    @cached_property
     def credits(self) -> tuple[Credit, ...]:
-        """Return the credit of each cause, largest first."""
-        k = len(self.ruler.steps) - 1
-        return tuple(
-            Credit(
-                name,
-                self.credit[name],
-                dict(
-                    zip(
-                        self.units,
-                        map(float, self.rms(self.decision.without[name])[k]),
-                        strict=True,
-                    )
-                ),
-                math.exp(min(self.lost[name], MOST_LOST)),
-            )
-            for name in ordered(self.credit, list(self.credit))
-        )
+        """The credit of each cause, largest first: its share of the total gain in log error.
+
+        If causes overlap, the shares sum to less than 1. If they depend on one another, so that the
+        losses sum to more than the total gain, the shares are normalised to 1.
+        """
+        gain, best, k = self.ruler.gain, self.best, len(self.ruler.steps) - 1
+        without = self.decision.without.items()
+        lost = {name: max(gain(fit, best).mean, 0.0) for name, fit in without}
+        whole = max(gain(self.decision.crude, best).mean, sum(lost.values()), 1e-12)
+        found = []
+        for name, fit in without:
+            errors = dict(zip(self.units, self.rms(fit)[k].tolist(), strict=True))
+            times = math.exp(min(lost[name], MOST_LOST))
+            found.append(Credit(name, lost[name] / whole, errors, times))
+        return tuple(sorted(found, key=lambda one: -one.share))
 
     def remainders(self) -> tuple[Remainder, ...]:
         """Return the leftovers: errors above the floor, and corrections that improve predictions.
@@ -302,27 +300,6 @@ class Measured:
         return replace(row, size=left.size, unit=left.unit, evidence=left.gain, region=region)
 
 
-def losses(ruler: Ruler, decision: Decision) -> dict[str, float]:
-    """Return by how much the log error grows without each cause, in the mean."""
-    without = decision.without.items()
-    return {name: max(ruler.gain(fit, decision.fit).mean, 0.0) for name, fit in without}
-
-
-def credited(ruler: Ruler, decision: Decision, lost: Mapping[str, float]) -> dict[str, float]:
-    """Return the share of the total gain (in log error) that is lost without each cause.
-
-    If causes overlap, the shares sum to less than 1. If they depend on one another, so that the
-    losses sum to more than the total gain, the shares are normalised to 1.
-    """
-    whole = ruler.gain(decision.crude, decision.fit).mean
-    return {name: loss / max(whole, sum(lost.values()), 1e-12) for name, loss in lost.items()}
-
-
-def ordered(shares_: dict[str, float], names: Sequence[str]) -> list[str]:
-    """Return names by their credit, largest first."""
-    return sorted(names, key=lambda name: -shares_.get(name, 0.0))
-
-
 MOMENTS = 400  # most moments at which the noise is propagated
 
 
@@ -338,12 +315,6 @@ def carried(ruler: Ruler, fit: Fitted) -> Array:
     each = [np.maximum(steps, first) for steps in ruler.steps]
     rows = [[of[int(k)][i] for i, k in enumerate(at)] for at in each]
     return np.array([*rows, np.full(len(first), np.nan)])
-
-
-def gap_of(ruler: Ruler, fit: Fitted, noise: Array) -> float:
-    """Return the held-out gap that a fit leaves at the longest horizon, relative to `carried`."""
-    shown, last = ruler.shown, len(ruler.steps) - 1
-    return float(np.sqrt(np.nanmean((ruler.errors(fit).rms / noise)[last, shown] ** 2)))
 
 
 def _noise_ahead(predictor: Predictor, fit: Fitted, steps: int) -> Array:

@@ -13,7 +13,7 @@ from grounded.diagnosis.parts import Unconfirmed
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, decide
 from grounded.diagnosis.validation.limits import limits
-from grounded.diagnosis.validation.measured import credited, losses
+from grounded.diagnosis.validation.measured import Measured
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.diagnosis.writer import unconfirmed
 from grounded.effects import Library
@@ -92,8 +92,8 @@ def test_what_predicts_better_is_claimed_with_its_worth(wavy, ruler):
     assert ruler.gain(decision.crude, decision.fit).mean > 1
     for less in decision.without.values():
         assert ruler.gain(less, decision.fit).pays
-    worth = credited(ruler, decision, losses(ruler, decision))
-    assert max(worth.values()) > 0.2 and sum(worth.values()) <= 1 + 1e-9
+    worth = [one.share for one in Measured(decision, ruler, axis(WAVE)[1], 0).credits]
+    assert max(worth) > 0.2 and sum(worth) <= 1 + 1e-9
 
 
 def test_what_is_as_likely_with_free_parameters_ties(wavy, ruler):
