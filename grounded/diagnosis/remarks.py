@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from grounded import places
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.causes import (
     acts_reversed,
@@ -18,14 +19,13 @@ from grounded.diagnosis.causes import (
 from grounded.diagnosis.error_report import RulerRow, errors, excess, lost_most, open_noise
 from grounded.diagnosis.levels import ALIKE, HALF, SURE
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.parts import Diagnosis, Estimate
+from grounded.diagnosis.parts import Diagnosis, Estimate, Ranked
+from grounded.diagnosis.validation.claims import Claims
+from grounded.effects import ParamFamily, like_a_load
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model, all_at_bounds
-
-if TYPE_CHECKING:
-    from grounded.diagnosis.validation.claims import Claims
-    from grounded.task import Task
-    from grounded.trial import Trial
+from grounded.task import Task
+from grounded.trial import Trial
 
 
 def quantity(e: Estimate) -> Quantity:
@@ -161,8 +161,6 @@ def _power_of_ten(ratio: float) -> bool:
 
 def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
     """What the model's structure lets a claimed effect stand for."""
-    from grounded import places
-
     names = {*d.effects}
     if any(name.startswith("sensor_scale:") for name in names):
         for state, rate in places.only_read(model).items():
@@ -193,8 +191,6 @@ def next_step(
         trials: those that were diagnosed.
         adopted: adopted effects, whose values are parameters of the model.
     """
-    from grounded.effects import ParamFamily, like_a_load
-
     model, names, effects = claims.data.model, claims.names, claims.best.hypothesis.effects
     if d.no_cause:
         return found("gap.next.record")
@@ -236,12 +232,12 @@ def next_step(
     return found("gap.next.adopt", own="yes" if own else "no", left=bool(d.leftover))
 
 
-def _to_flip(row: object, ended: bool) -> bool:
+def _to_flip(row: Ranked, ended: bool) -> bool:
     """Return whether an input's sign is to be flipped before anything is adopted.
 
     If parameters ended at their bounds, the strength of a reversed input is not known.
     """
-    name, params = row.effect, row.params  # type: ignore[attr-defined]
+    name, params = row.effect, row.params
     gain = name.startswith("input_gain:")
     return sign_only(name, params) or (ended and gain and acts_reversed(params))
 

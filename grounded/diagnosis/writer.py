@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded import places
 from grounded.diagnosis.causes import meaning, value_called
 from grounded.diagnosis.error_report import (
     AT_MOST,
@@ -50,7 +49,7 @@ from grounded.diagnosis.validation.measured import (
     explained,
 )
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects import Effect, RateFamily, acting_order, wrapping_order
+from grounded.effects import acting_order, wrapping_order
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.places import position
@@ -317,8 +316,7 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
     names = tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few])
     h = one.fit.hypothesis
     i = h.names.index(one.name)
-    anywhere = _anywhere(h.effects[i])
-    regions = by_region(acts, claims.predictor, one.fit, 1, but=anywhere)
+    regions = by_region(acts, claims.predictor, one.fit, 1)
     each = claims.estimates(one.fit)
     if one.name in sizeless(h, np.array([e.std for some in each for e in some.values()])):
         return None
@@ -332,15 +330,6 @@ def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
         few > 1,
         names,
     )
-
-
-def _anywhere(effect: Effect) -> Sequence[str]:
-    """Return the coordinates on the ground if an effect acts alike at all places.
-
-    A motor's delay showed "where y < -3.95 m": only the drive by hand went there.
-    """
-    where = places.position(effect.site.model)
-    return () if len(where) < 2 or isinstance(effect.family, RateFamily) else where
 
 
 def acting(predictor: Predictor, fit: Fitted, name: str) -> Array:

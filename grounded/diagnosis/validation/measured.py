@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
@@ -396,9 +396,7 @@ def by_time(gain: Array, data: Data, parts: int = 8) -> list[TimeShare]:
     ]
 
 
-def by_region(
-    gain: Array, predictor: Predictor, fit: Fitted, most: int = 3, but: Collection[str] = ()
-) -> list[Region]:
+def by_region(gain: Array, predictor: Predictor, fit: Fitted, most: int = 3) -> list[Region]:
     """Return the half-spaces of a state or an input with most of the gap in little of the time.
 
     Args:
@@ -406,15 +404,13 @@ def by_region(
         predictor: has the data.
         fit: its states.
         most: number of regions, at most one a signal.
-        but: states that are left out.
     """
     data = predictor.data
     model = data.model
     signals: list[tuple[str, Array]] = []
     u = data.runs(data.commands)
     signals += [(n, u[..., j]) for j, n in enumerate(model.input_names)]
-    hidden = {*but, *(model.state_names[i] for i in data.hidden)}
-    shown = [(i, n) for i, n in enumerate(model.state_names) if n not in hidden]
+    shown = [(i, n) for i, n in enumerate(model.state_names) if i not in data.hidden]
     signals += [(n, fit.track[:-1, :, i]) for i, n in shown]
     signals.append(("t", data.time))
     units = {**model.states, **model.inputs, "t": "s"}
