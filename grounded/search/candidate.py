@@ -145,24 +145,6 @@ class Candidate(Result):
             return self.predicted_gain
         return self.predicted_utility - best.utility
 
-    def less_in_log(self, best: Tried, missed: float) -> Finding | None:
-        """Return that its log is expected to show less than the best one's, although it gains.
-
-        The gain is one within the model, which replays the best one's run with the noise in it.
-
-        Args:
-            best: the best so far.
-            missed: what its log costs more than its prediction, due to sensor noise.
-        """
-        gain, in_log = self.promised_over(best), self.predicted_utility - missed
-        if not (gain > 0 and in_log < best.utility and self.base == best.candidate.id):
-            return None
-        if self.unlike(best.utility) or not self.grounded:  # told by what the model gives the best
-            return None
-        return found(
-            "plan.small", self.id, candidate=self.id, best=self.base, gain=gain, log=in_log
-        )
-
     def doubt(self, best: Tried | None) -> Finding | None:
         """Return why it may lose although it promises a gain; None if it is not `doubtful`."""
         if not self.doubtful:

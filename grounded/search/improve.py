@@ -30,7 +30,7 @@ import numpy as np
 
 from grounded.checks import list_of, of_type, refused
 from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.findings import found
 from grounded.model import Model
 from grounded.search.candidate import BY_STEP, Candidate, Tried
 from grounded.search.difference import few, one_trial_error
@@ -121,42 +121,13 @@ def propose(
             return made
         slow = found("plan.not_optimal", why=plan.sentence, share=_slowly(plan), last=LATEST)
         return replace(made, findings=(*made.findings, slow))
-    made = _improvement(make, now.incumbent, options)
-    if made.candidate is None:
-        return made
-    before = standing(task, candidates, trials[:-1], options, fingerprint, planner)
-    again = _run_again(before, now, trials[-1], made.candidate)
-    return replace(made, findings=(*made.findings, again)) if again else made
+    return _improvement(make, now.incumbent, options)
 
 
 def _slowly(plan: Solution) -> float | None:
     """Return the share by which the last iterations of a plan lowered its cost; None for few."""
     costs = [line.cost for line in plan.trace[-LATEST:]]
     return 1 - costs[-1] / costs[0] if len(costs) == LATEST and costs[0] > 0 else None
-
-
-def _run_again(before: Standing, now: Standing, last: Trial, made: Candidate) -> Finding | None:
-    """Return that a search goes on after a run of its best candidate that it did not ask for.
-
-    It may have ended before that run; None for other runs, and if the model was changed since.
-
-    Args:
-        before: the standing of the search without the last trial.
-        now: the standing with it.
-        last: the last trial.
-        made: the next candidate.
-    """
-    was, best = before.incumbent, now.incumbent
-    if was is None or best is None or before.phase is Phase.AWAIT:
-        return None
-    if now.history[-1].candidate.model != made.model:
-        return None
-    own = was.candidate.id
-    ran = next((tried for tried in now.history if tried.candidate.id == own), None)
-    if last.candidate != own or ran is None:
-        return None
-    other, mean = best.candidate.id if best.candidate.id != own else None, ran.utility
-    return found("plan.run_again", own, best=own, mean=mean, was=was.utility, other=other)
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:

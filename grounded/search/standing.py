@@ -158,16 +158,6 @@ class Standing(Result):
         return self.ending.value
 
     @property
-    def less_in_log(self) -> Finding | None:
-        """That the candidate that waits for its first run may show less than the best."""
-        made = self.outstanding
-        waiting = (t for t in self.history if t.candidate is made and not t.trials)
-        tried = next(waiting, None)
-        if made is None or tried is None or self.incumbent is None:
-            return None
-        return made.less_in_log(self.incumbent, tried.noise_missed)
-
-    @property
     def lead(self) -> Difference | None:
         """How the best one compares with the model's own policy; None if that is the best."""
         best, own = self.incumbent, self.history[0] if self.history else None

@@ -53,8 +53,7 @@ ENTRIES: dict[str, Entry] = {
     "so_far": Entry(
         "note",
         "{utility} by {best}[[, {noise} of it by sensor noise]][[; for {best} itself the model "
-        "predicts {model}, of which {candidate} is to gain {gain}]][[; about {log} is expected of "
-        "the log of {candidate}, with noise that the prediction lacks]]",
+        "predicts {model}, of which {candidate} is to gain {gain}]]",
     ),
     "tested": Entry(
         "note",
@@ -89,11 +88,6 @@ ENTRIES: dict[str, Entry] = {
         "there is no manoeuvre to learn: [task] names no target",
         "draw one with `grounded target`; `fit` and `diagnose` need none",
     ),
-    "draw_again": Entry(
-        "note",
-        "`next:` draws the same line so that the plan comes to rest",
-        "to run {candidate} as it is: `{command}`",
-    ),
     "waits_void": Entry(
         "refuse",
         "{standing}, but {why}",
@@ -104,11 +98,6 @@ ENTRIES: dict[str, Entry] = {
         "the plan is not optimal in the model: {why}[[ (the last {last} by {share:%})]]; it can be "
         "run all the same: the steps from its run go on improving it",
     ),
-    "run_again": Entry(
-        "note",
-        "{best} was run again, and the mean of its runs is now {mean} instead of {was}[[: {other} "
-        "is the best now]]; the search goes on from there",
-    ),
     "doubtful": Entry(
         "note",
         "{candidate} may well lose: it promises {gain:.3g} over {best}, but judging by earlier "
@@ -118,9 +107,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "small": Entry(
         "note",
-        "{candidate} promises {gain:.2g} over {best}, less than its trial can show[[: about {log} "
-        "is expected of its log, with the noise that the prediction lacks]][[: a gain below "
-        "{least:.2g} may be luck]][[, from {few:repeat} only]][[. To show it takes {runs} runs of "
+        "{candidate} promises {gain:.2g} over {best}, less than its trial can show: a gain below "
+        "{least:.2g} may be luck[[, from {few:repeat} only]][[. To show it takes {runs} runs of "
         "each of the two]]",
         "[[stop? if that is too many, stop with {best} (`export best`)]]",
     ),
@@ -139,11 +127,6 @@ ENTRIES: dict[str, Entry] = {
         "[limits] are only the range used in {log}[[; {at} is at them for {share:%} of this plan]]",
         "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
         "(`target`): target.csv is the run in that log]]",
-    ),
-    "of_other_limits": Entry(
-        "note",
-        "[reward] input_change of {about} was made for a different range from that in [limits]",
-        "write input_change = {new} there, or draw the target again",
     ),
     "falls_short": Entry(
         "note",
@@ -165,13 +148,7 @@ ENTRIES: dict[str, Entry] = {
         "{about:its/their} target]][[!unweighed? nothing in [reward] keeps {about:it/them} "
         "inside]]",
         "[[unweighed? add one in [reward] state]][[!unweighed? draw the target with a column for "
-        "{about:it/each of them}]][[ (`{command}`)]]",
-    ),
-    "leaves": Entry(
-        "note",
-        "nothing was run yet",
-        "draw a target whose run stays inside [safety] (`target`); widen [safety] only if the "
-        "robot may go there",
+        "{about:it/each of them} (`target`); widen [safety] only if the robot may go there]]",
     ),
     "not_at_rest": Entry(
         "warn",
@@ -223,12 +200,6 @@ ENTRIES: dict[str, Entry] = {
         "{of:.4g}",
     ),
     # what the robot will do
-    "near_safety": Entry(
-        "note",
-        "no run has tested the prediction yet, and it comes within {left} of the {side} bound of "
-        "{state} in [safety], at {at}",
-        STOP,
-    ),
     "not_logged": Entry(
         "note",
         "{candidate} feeds back {about}, of which the log has no column: your program has to "

@@ -1,11 +1,10 @@
-"""A run that the search asked for is taken, also if another run settled what it was to settle."""
+"""A run that costs the best candidate its place is told as one more run of it."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from grounded.errors import GroundedError
 from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -51,14 +50,3 @@ def test_a_run_that_costs_the_best_its_place_is_told_as_one_more_run_of_it(doubt
     found = ingest_log(doubtful, doubtful.unnamed, "c0001")
     assert (found.candidate, found.verdict) == ("c0001", "run again")
     assert standing_in(doubtful).incumbent.candidate.id == "c0002"
-
-
-def test_the_run_that_was_asked_for_is_taken_without_its_name(doubtful):
-    ingest_log(doubtful, doubtful.worse(0.81), "c0002")
-    moved = doubtful.best.states + 1e-6
-    write_trial(doubtful.unnamed, replace(doubtful.best, states=moved, candidate=""), {})
-    found = ingest_log(doubtful, doubtful.unnamed)
-    assert (found.candidate, found.verdict) == ("c0001", "run again")
-    write_trial(doubtful.unnamed, replace(doubtful.best, states=moved + 1e-6, candidate=""), {})
-    with pytest.raises(GroundedError, match="no candidate is waiting"):  # one run was asked for
-        ingest_log(doubtful, doubtful.unnamed)

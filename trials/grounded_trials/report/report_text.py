@@ -41,8 +41,7 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
         lines += ["", table([now.row(one) for one in kept], now.table()[1])]
         more = f"({left} more: {rendered(NextCommand('status'), findings.folder)})"
         spark = bars([tried.utility for tried in history if tried.utilities])
-        less = now.less_in_log.sentence if now.less_in_log else ""
-        lines += _indented(filter(None, (more * bool(left), spark, less)))
+        lines += _indented(filter(None, (more * bool(left), spark)))
     lines += _indented([f"{now.outcome}: {findings.outlook}"])
 
     # errors by state, and what was diagnosed

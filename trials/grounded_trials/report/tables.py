@@ -239,8 +239,7 @@ def _candidates(findings: Findings) -> list[Block]:
     status = rendered(NextCommand("status"), findings.folder)
     more = [Block("text", f"{left} more"), Block("command", status, "c-status")] * bool(left)
     why = legend("", [t.candidate.iteration for t in kept])
-    told = (why, now.less_in_log.sentence if now.less_in_log else "")
-    return [made, *(Block("soft", f"{begun(words)}.") for words in told if words), *more]
+    return [made, *([Block("soft", f"{begun(why)}.")] if why else []), *more]
 
 
 def _terms(findings: Findings) -> Block:

@@ -21,14 +21,12 @@ from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model, is_clock
 from grounded.places import integrals, rate_states, true_values
-from grounded.search.candidate import Candidate
-from grounded.search.safety import coasts_out
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import per_second, with_unit
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import tracked, usual_weights
+from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import OFFERED
 from grounded_trials.workspace.user_files.task_file import SMALLEST_RANGE
 
@@ -155,6 +153,7 @@ AT_REST_SHARE = 1e-3
 ZERO_INPUT = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
 MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
+STILL = 1e-9  # motion in a step, in a state's unit, that counts as none
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
 
@@ -171,26 +170,28 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
             checked too, since they may have held that one.
     """
     base, planner, config = workspace.task, workspace.planner, workspace.config.task
-    task, loose = planner.plan, planner.loose
+    task, n, names = planner.plan, base.model.n, planner.plan.model.input_names
     assert base.latency is not None
-    names, states, n = task.model.input_names, task.model.state_names, base.model.n
-    memory = np.arange(task.model.n) >= n  # the memory states of adopted effects: they settle
-    free = memory.copy()
+
+    # The input is solved for with the memory of adopted effects, which settles, and if that rests
+    # nowhere with the few states without a start, too; the start of a sensor with a bias is none.
+    memory = np.arange(task.model.n) >= n
     biased = {str(e["name"]).removeprefix("sensor_bias:") for e in workspace.config.model.effects}
-    # a start taken from the target is off by the bias of a sensor: such a state is free too
-    begun = dict(zip(states, base.target[0], strict=False))
-    free[:n] = [s not in config.start and (np.isnan(x) or s in biased) for s, x in begun.items()]
+    free = memory.copy()
+    for i, name in enumerate(base.model.state_names):
+        free[i] = name not in config.start and (np.isnan(base.target[0, i]) or name in biased)
     free[[one.j for one in integrals(base.model) if one.exact]] = False  # at rest, a rate is 0
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if (chosen and not again) or not priced else resting(task, memory, loose)
+    stands = None if (chosen and not again) or not priced else resting(task, memory, planner.loose)
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
-        stands = resting(task, free, loose)
+        stands = resting(task, free, planner.loose)
     if stands is None:
         return None
-    units = {**base.model.states, **task.model.inputs}
-    given = np.concatenate([task.start[:n], task.past])
-    stands = np.concatenate([stands[:n], stands[len(states) :]])
+
+    # It is told where it differs from what is given by more than rounding.
+    given = np.append(task.start[:n], task.past)
+    stands = np.append(stands[:n], stands[task.model.n :])
     turned = given[:n] + base.model.difference(stands[:n], given[:n])
     stands[:n] = np.where(base.model.angle_mask, turned, stands[:n])  # no whole turns
     span = np.append(np.ones(n), task.high - task.low)
@@ -198,39 +199,24 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
     stands[np.abs(stands) < ZERO_INPUT * span] = 0.0
     if not (np.abs(stands - given) > (MOVED if chosen else ZERO_INPUT) * span).any():
         return None
-    moved = moved_at_start(task, task.past) / task.dt
-    rate = moved[:n].copy()  # of a state that is logged through a filter, the true rate
-    for memory_state, own in true_values(states, states[n:]).items():
-        rate[own] = max(rate[own], moved[memory_state], key=abs)
+    rate = moved_at_start(task, task.past)[:n] / task.dt
+    k = int(np.argmax(np.abs(rate)))
+    units, state = {**base.model.states, **task.model.inputs}, base.model.state_names[k]
     told = np.abs(stands - given) > AT_REST_SHARE * (1 + np.abs(stands))
     told[n:] = True
-    k = int(np.argmax(np.abs(rate)))
     other = {name: to for name, to, tell in zip(units, stands, told, strict=True) if tell}
     before = dict(zip(units, given, strict=True))
-    held = tuple(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other)
     whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
     whole |= {name: f"{to:.4g}" for name, to in other.items()}
     return found(
         "plan.not_at_rest",
-        states[k],
+        state,
         then=NextCommand("propose"),  # after [task] start is changed
-        held=held,
-        state=states[k],
-        rate=Quantity(rate[k], per_second(units[states[k]])),
+        held=tuple(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other),
+        state=state,
+        rate=Quantity(rate[k], per_second(units[state])),
         start=f"{{ {', '.join(f'{n} = {whole[n]}' for n in units if n in whole)} }}",
     )
-
-
-def moves_by(task: Task, free: NDArray[np.bool_]) -> float:
-    """Return how far a state moves at most in one step under the input held before; 0 at rest.
-
-    Args:
-        task: the task with the start.
-        free: (n,), states among which those of clocks are ignored.
-    """
-    clocks = free & [is_clock(name) for name in task.model.state_names]
-    away = float(np.abs(moved_at_start(task, task.past))[~clocks].max())
-    return away if away > 1e-9 else 0.0
 
 
 def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
@@ -251,8 +237,8 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
     from grounded.search.first_guess import trim
 
     clocks = free & [is_clock(name) for name in task.model.state_names]
-    free, away = free & ~clocks, moves_by(task, free)
-    if not away or _out_of_reach(task, free, clocks):
+    free, away = free & ~clocks, np.abs(moved_at_start(task, task.past))[~clocks].max()
+    if away <= STILL or _out_of_reach(task, free, clocks):
         return None
     still = np.tile(task.start, (2, 1))
     still[1, clocks] += task.dt
@@ -346,20 +332,6 @@ def _rest_of(workspace: Folder, stand: Stand) -> dict[str, float]:
     return found | {n: v for n, v in inputs.items() if found and v}
 
 
-def ended_at_rest(task: Task, run: Trial, held: Array) -> Trial:
-    """Return a run that ends where a predicted one does, but at rest and under the held input.
-
-    Args:
-        task: says which states are rates of positions.
-        run: the predicted run, with the planning model's states.
-        held: the input that is sent after it (m,).
-    """
-    still = run.states.copy()
-    still[-1, [one.j for one in integrals(task.model) if one.exact]] = 0.0
-    return replace(run, states=still, inputs=np.tile(held, (run.steps, 1)), start_inputs=held)
-
-
-HOLD = 1.0  # [s] at rest that are proposed at least
 NOISY = 0.02  # most utility that the noise of a state may cost at the end, by its weight
 
 
@@ -413,53 +385,3 @@ def rest_at_end(
         if name in found and weights[name] * noise**2 > NOISY:
             weights[name], noisy[name] = NOISY / noise**2, noise
     return Rest(found, {name: float(f"{w:.6g}") for name, w in weights.items()}, noisy)
-
-
-def to_end_at_rest(workspace: Folder, made: Candidate) -> NextCommand | None:
-    """Return the `target` command for a line whose plan leaves [safety] after its end, else None.
-
-    It draws the same line so that free states rest at its end, and holds it there for a while.
-    """
-    planner, task = workspace.planner, workspace.task
-    held = np.clip(made.policy.past, made.policy.low, made.policy.high)
-    run = planner.lift(made.predicted_run)
-    if not coasts_out(task, planner.plan, run, held):
-        return None
-    if (line := drawn(task)) is None or line.arguments[0] != "line":
-        return None
-    given = {*tracked(task)}
-    free = [name for i, name in enumerate(task.model.state_names) if i not in given]
-    words, rests = [*line.arguments], _rests(task)
-    seconds = (task.horizon - rests) * task.dt
-    words += ["--seconds", f"{seconds:.6g}"]
-    if not free and rests * task.dt >= HOLD:
-        return None
-    if not free and coasts_out(task, planner.plan, ended_at_rest(task, run, held), held):
-        return None  # an arm falls from rest as well: the input that is sent afterwards lets it go
-    words += ["--hold", f"{max(rests * task.dt, HOLD):.6g}", *["--rest"] * bool(free)]
-    return NextCommand("target", tuple(words))
-
-
-def _rests(task: Task) -> int:
-    """Return the number of steps at the end in which the target does not move."""
-    given = task.target[:, tracked(task)]
-    still = np.all(np.isclose(given, given[-1], atol=1e-9), axis=1)
-    return int(np.argmin(still[::-1])) - 1 if not still.all() else task.horizon
-
-
-def drawn(task: Task) -> NextCommand | None:
-    """Return the `target` command for the line or step that a target appears to be; else None."""
-    names, rates = task.model.state_names, {*rate_states(task.model).values()}
-    given = [i for i in tracked(task) if names[i] not in rates]
-    way = task.model.difference(task.target, task.start)[:, given]
-    if not way.any():
-        return None
-    k = int(np.argmax(np.abs(way[-1])))
-    if not way[-1, k]:
-        return None
-    share = way[:, k] / way[-1, k]
-    if not np.allclose(way, share[:, None] * way[-1], atol=1e-6 * abs(way[-1, k])):
-        return None
-    shape = "step" if np.allclose(share[1:], 1.0) else "line"
-    to = (("--to", f"{names[i]}={task.target[-1, i]:g}") for i in given)
-    return NextCommand("target", (shape, *(word for pair in to for word in pair)))

@@ -12,35 +12,27 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
-from grounded.errors import NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.places import samples
 from grounded.search.feedback.oscillation import jumps
 from grounded.search.scatter import sensor_noise
 from grounded.task import Task
-from grounded.trial import Trial
-from grounded_trials.wording import rendered
-from grounded_trials.workspace.candidates.at_rest import drawn, held_before, to_end_at_rest
-from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.at_rest import held_before
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.new_target import still_logged
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
-from grounded_trials.workspace.user_files.config import made_changes
-from grounded_trials.workspace.user_files.task_file import limited_changes, seen_in
+from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal
 
-LIMITED = 0.25  # share of a plan at the limits of an input, which keep it off its target then
-MISSED = 0.05  # share of the target's extent above which an error is told; SHORT: at the plan's end
-SHORT = 0.25
+# share of the target's extent above which a plan's error is told: where inputs are at their limits
+# for the share LIMITED of the plan, and at its end
+MISSED, SHORT, LIMITED = 0.05, 0.25, 0.25
 SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
-PIECES = 10  # pieces of the plan in which the effect of noise is computed
 OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
-OTHER = 1.5  # ratio of weights above which a weight was made for other [limits]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,16 +56,20 @@ class Plan:
         """The task with the crude model."""
         return self.workspace.task
 
-    def at_limits(self, made: Candidate) -> Iterator[tuple[str, float]]:
-        """Yield the share of a plan for which each input is at one of its limits."""
-        task, aim = self.task, self.task.input_target
+    def at_limits(self, made: Candidate) -> dict[str, float]:
+        """Return the share of a plan for which each input is at one of its limits."""
+        task, aim, shares = self.task, self.task.input_target, {}
         assert aim is not None
         for j, name in enumerate(task.model.input_names):
-            ends = [float(end) for end in (task.low[j], task.high[j]) if np.isfinite(end)]
-            ends = [end for end in ends if not np.allclose(aim[:, j], end)]
+            ends = [end for end in (task.low[j], task.high[j]) if np.isfinite(end)]
             sent = made.predicted_inputs[:, j]
-            at = [np.isclose(sent, end, rtol=1e-3, atol=1e-9) for end in ends]
-            yield name, float(np.any(at, axis=0).mean()) if at else 0.0
+            at = [
+                np.isclose(sent, end, rtol=1e-3, atol=1e-9)
+                for end in ends
+                if not np.allclose(aim[:, j], end)
+            ]
+            shares[name] = float(np.any(at, axis=0).mean()) if at else 0.0
+        return shares
 
 
 def left_open(workspace: Folder, proposal: Proposal, again: bool) -> list[Finding]:
@@ -86,14 +82,8 @@ def left_open(workspace: Folder, proposal: Proposal, again: bool) -> list[Findin
         proposal: the first plan, or why there is none.
         again: whether another model was used for an earlier plan.
     """
-    plan, told = Plan(workspace, proposal.candidate, proposal.refused, again), list[Finding]()
-    for check in CHECKS:
-        asked = any(one.then for one in told)
-        told += [one for one in check(plan) if not (one.then and asked)]
-    unsaid = not {"plan.unguarded", "plan.not_at_rest"} & {one.code for one in told}
-    if plan.refused is not None and unsaid and leaving(plan).any():
-        told.append(found("plan.leaves"))
-    return told
+    plan = Plan(workspace, proposal.candidate, proposal.refused, again)
+    return [one for check in CHECKS for one in check(plan)]
 
 
 def no_motion(plan: Plan) -> Iterator[Finding]:
@@ -139,66 +129,35 @@ def limits_of_log(plan: Plan) -> Iterator[Finding]:
     """[limits] are only what a log used."""
     if not (log := seen_in(plan.workspace.config)):
         return
-    shares = [] if plan.made is None else [*plan.at_limits(plan.made)]
-    share, at = max(((share, name) for name, share in shares), default=(0.0, ""))
+    shares = {"": 0.0} if plan.made is None else plan.at_limits(plan.made)
+    at = max(shares, key=lambda name: shares[name])
     yield found(
         "plan.limits_of_log",
         log=log,
-        at=at or None,
-        share=share,
+        at=at if shares[at] else None,
+        share=shares[at],
         logged=int(still_logged(plan.workspace)),
     )
 
 
-def of_other_limits(plan: Plan) -> Iterator[Finding]:
-    """Weights on input changes were made for other [limits] than the current ones."""
-    config, model = plan.workspace.config, plan.workspace.base_model
-    made = made_changes(config.file.read_text(encoding="utf-8"))
-    weights = dict(zip(model.input_names, plan.task.reward.input_change, strict=True))
-    now = {name: by for name, (_, by) in limited_changes(config, model).items()}
-    off = [
-        name
-        for name, by in now.items()
-        if weights[name] == made.get(name) and not 1 / OTHER < weights[name] / by < OTHER
-    ]
-    if off:
-        new = ", ".join(f"{name} = {now.get(name, w):.4g}" for name, w in weights.items() if w)
-        yield found("plan.of_other_limits", *off, new=f"{{ {new} }}")
-
-
 def off_target(plan: Plan) -> Iterator[Finding]:
     """The plan misses its target: by [limits], by other weights, or as the model can't reach it."""
-    if plan.made is None or not (groups := weighed_groups(plan.task)):
+    if plan.made is None or not weighed_groups(plan.task):
         return
-    task, limited = plan.task, [*plan.at_limits(plan.made)]
-    what, off, share = _most_missed(task, plan.made.predicted_run)
-    at = [name for name, part in limited if part > LIMITED]
-    if at and share > MISSED:
-        most = max(part for _, part in limited)
-        yield found("plan.falls_short", *at, share=most, what=what, off=off)
-        return
-    names, what = groups[0]
-    states, unit = [task.model.state_names.index(n) for n in names], task.model.states[names[0]]
-    last = task.model.difference(plan.made.predicted_states[-1], task.target[-1])[states]
-    short, extent = float(np.linalg.norm(last)), _extent(task, states)
-    if short > SHORT * extent > 0:
-        yield found("plan.falls_short", what=what, off=Quantity(short, unit))
-
-
-def _extent(task: Task, states: Sequence[int]) -> float:
-    """Return the diagonal of the box that the start and the target of some states span."""
-    return float(np.linalg.norm(np.ptp(np.vstack([task.start, task.target])[:, states], axis=0)))
-
-
-def _most_missed(task: Task, run: Trial) -> tuple[str, Quantity, float]:
-    """Return what a plan misses most, by how much, and that as a share of the target's extent."""
-    error, each = tracking_error(task, run), []
+    task, shares, error = plan.task, plan.at_limits(plan.made), []
+    at = [name for name, share in shares.items() if share > LIMITED]
+    missed = tracking_error(task, plan.made.predicted_run)
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
-        far = float(np.linalg.norm(error[:, states], axis=1).max())
-        share = far / max(_extent(task, states), 1e-300)
-        each.append((what, Quantity(far, task.model.states[names[0]]), share))
-    return max(each, key=lambda one: one[2])
+        far = np.linalg.norm(missed[:, states], axis=1)
+        off = float(far.max() if at else far[-1])
+        extent = np.ptp(np.vstack([task.start, task.target])[:, states], axis=0)
+        error.append((off / max(float(np.linalg.norm(extent)), 1e-300), off, what, names[0]))
+    share, off, what, name = max(error) if at else error[0]
+    if share > (MISSED if at else SHORT):
+        most = max(shares.values()) if at else None
+        missing = Quantity(off, task.model.states[name])
+        yield found("plan.falls_short", *at, share=most, what=what, off=missing)
 
 
 def rough(plan: Plan) -> Iterator[Finding]:
@@ -206,53 +165,37 @@ def rough(plan: Plan) -> Iterator[Finding]:
     if plan.made is None:
         return
     task, gain = plan.task, plan.made.policy.gain
-    times = jumps(plan.made.predicted_inputs, task.high - task.low)
+    span, planned = task.high - task.low, np.ptp(plan.made.predicted_inputs, axis=0)
+    times = jumps(plan.made.predicted_inputs, span)
     for name, often in zip(task.model.input_names, times.tolist(), strict=True):
         if often >= OFTEN:
             yield found("plan.rough", name, input=name, times=often)
     if gain is None or (times >= OFTEN).any():
         return
     noise = sensor_noise(plan.workspace.task_trials(), plan.workspace.base_model.n)
-    parts = gain[:, :, : task.model.n] ** 2 * noise**2  # (H, m, n)
-    pieces = np.array_split(parts, min(PIECES, len(parts)))  # gains grow towards an end
-    each = np.sqrt([piece.sum(axis=2).mean(axis=0) for piece in pieces])  # (pieces, m)
-    span, planned = task.high - task.low, np.ptp(plan.made.predicted_inputs, axis=0)
+    by_state = np.mean(gain[:, :, : task.model.n] ** 2 * noise**2, axis=0)  # (m, n)
+    shaken = np.sqrt(by_state.sum(axis=1))
     allowed = np.where(np.isfinite(span), span, planned)
     for j, (name, unit) in enumerate(task.model.inputs.items()):
-        most = int(np.argmax(each[:, j]))
-        if each[most, j] > SHAKEN * allowed[j] > 0:
-            state = task.model.state_names[int(np.argmax(pieces[most][:, j].mean(axis=0)))]
-            shaken = Quantity(each[most, j], unit)
-            yield found("plan.rough", name, input=name, shaken=shaken, state=state)
+        if shaken[j] > SHAKEN * allowed[j] > 0:
+            state = task.model.state_names[int(np.argmax(by_state[j]))]
+            yield found(
+                "plan.rough", name, input=name, shaken=Quantity(shaken[j], unit), state=state
+            )
 
 
 def unguarded(plan: Plan) -> Iterator[Finding]:
-    """States leave [safety] that have no target, or no weight on it."""
+    """States leave [safety] in a refused plan that have no target, or no weight on it."""
     if plan.refused is None:
         return
-    task, out = plan.task, leaving(plan)
+    task, states = plan.task, plan.refused.predicted_states
+    assert task.safety_low is not None and task.safety_high is not None
+    out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=0)
     weight = task.reward.state + task.reward.terminal
     given, names = np.isfinite(task.target).any(axis=0), task.model.state_names
-    if bare := [names[i] for i in np.flatnonzero(out & ~given)]:
-        line, command = drawn(task), None
-        to = [("--to", f"{name}={task.start[names.index(name)]:g}") for name in bare]
-        if line is not None:
-            again = NextCommand(
-                line.verb, (*line.arguments, *(word for pair in to for word in pair))
-            )
-            command = rendered(again, plan.workspace.address)
-        yield found("plan.unguarded", *bare, command=command)
-    if free := [names[i] for i in np.flatnonzero(out & given & (weight == 0))]:
-        yield found("plan.unguarded", *free, unweighed=1)
-
-
-def leaving(plan: Plan) -> NDArray[np.bool_]:
-    """Return which states leave [safety] in the refused plan, (n,) bool."""
-    task = plan.task
-    assert task.safety_low is not None and task.safety_high is not None
-    assert plan.refused is not None
-    states = plan.refused.predicted_states
-    return np.asarray(((states < task.safety_low) | (states > task.safety_high)).any(axis=0))
+    for which, unweighed in ((~given, 0), (given & (weight == 0), 1)):
+        if bare := [names[i] for i in np.flatnonzero(out & which)]:
+            yield found("plan.unguarded", *bare, unweighed=unweighed)
 
 
 def unused_rows(plan: Plan) -> Iterator[Finding]:
@@ -269,25 +212,14 @@ def not_at_rest(plan: Plan) -> Iterator[Finding]:
         yield one
 
 
-def leaves_after_its_end(plan: Plan) -> Iterator[Finding]:
-    """A line's plan leaves [safety] after its end: it can be drawn so that it ends at rest."""
-    if plan.made is None or (rest := to_end_at_rest(plan.workspace, plan.made)) is None:
-        return
-    name = plan.made.id
-    command = rendered(to_run(plan.workspace, name), plan.workspace.address)
-    yield found("plan.draw_again", then=rest, candidate=name, command=command)
-
-
-CHECKS: tuple[Callable[[Plan], Iterator[Finding]], ...] = (
+CHECKS: Sequence[Callable[[Plan], Iterator[Finding]]] = (
     no_motion,
     no_limits,
     without_effect,
     limits_of_log,
-    of_other_limits,
     off_target,
     rough,
     unguarded,
     unused_rows,
     not_at_rest,
-    leaves_after_its_end,
 )

@@ -33,10 +33,11 @@ from grounded.search.candidate import Candidate
 from grounded.search.difference import beyond_one_trial
 from grounded.search.feedback.oscillation import quiet_gains
 from grounded.search.safety import coasts_out, objections, spread
-from grounded.search.standing import Standing, standing
+from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import what_became
+from grounded_trials.workspace.candidates.search_state import standing_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
 from grounded_trials.workspace.readings import twice_in_time
@@ -46,8 +47,6 @@ if TYPE_CHECKING:
 
 INSPECT = NextCommand("inspect", ("LOG",))  # lists what [log] may map
 PROPOSE = NextCommand("propose")
-NEAR_BOUND = 0.25  # fraction of a state's range in the run: bounds farther away are not reported
-NEARER = 0.01  # fraction of that range by which a run must approach a bound from its start
 AGREES = 1e-6  # tolerance, relative to an input's size, for a policy to repeat its prediction
 
 
@@ -220,14 +219,11 @@ class Check:
         """The standing of the search."""
         if self.now is not None:
             return self.now
-        here = self.workspace
         try:
-            candidates = here.read().candidates
+            contents = self.workspace.read()
         except GroundedError:
-            candidates = here.read(strict=False).candidates
-        trials = [t.trial for t in self.trials if here.fits(t.trial)]
-        options, planner = here.config.search, here.planner
-        return standing(here.task, candidates, trials, options, planner.fingerprint, planner)
+            contents = replace(self.workspace.read(strict=False), trials=self.trials)
+        return standing_of(self.workspace, contents)
 
     @property
     def same_task(self) -> bool:
@@ -301,7 +297,7 @@ class Check:
         elif self._changed:
             told.append(found("plan.outdated", name, candidate=name))
         if self.same_task and not self.standing.trials:
-            told += [self._untried(), self._not_logged(), self._too_long()]
+            told += [self._not_logged(), self._too_long()]
         if self.same_task:
             told.append(self._coasting())
         yield from (one for one in told if one is not None)
@@ -327,32 +323,6 @@ class Check:
             if one.trial.candidate == name:
                 told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
                 yield told.knowing({"why": aside[one.stored.id]})
-
-    def _untried(self) -> Finding | None:
-        """Return that the first run is predicted to come near bounds of [safety].
-
-        Bounds that the run does not approach from where it starts are left out.
-        """
-        task, made = self.workspace.task, self.candidate
-        assert task.safety_low is not None and task.safety_high is not None
-        near = []
-        for i, (name, unit) in enumerate(task.model.states.items()):
-            low, high, values = task.safety_low[i], task.safety_high[i], made.predicted_states[:, i]
-            far = max(np.ptp(values), 1e-12)
-            for side, room in (("lower", values - low), ("upper", high - values)):
-                t = int(np.argmin(room))
-                if (
-                    np.isfinite(room[t])
-                    and room[0] - room[t] > NEARER * far
-                    and room[t] < NEAR_BOUND * far
-                ):
-                    near.append((room[t] / far, name, side, Quantity(room[t], unit), t * task.dt))
-        if not near:
-            return None
-        _, name, side, left, at = min(near)
-        return found(
-            "plan.near_safety", name, left=left, side=side, state=name, at=Quantity(at, "s")
-        )
 
     def _not_logged(self) -> Finding | None:
         """Return which states are fed back although [log] has no column of them, only estimates."""

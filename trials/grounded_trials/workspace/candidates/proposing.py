@@ -249,7 +249,7 @@ def _told(
         again,
         trust.made_how(made, task, now.history),
         trust.predicted(made, cost, whole, begun),
-        None if best is None else trust.so_far(made, best, cost),
+        None if best is None else trust.so_far(made, best),
         trust.trust(workspace, made, now, whole - cost, status.diagnosis, status.since),
         trust.extent_of(made, task),
     )
@@ -368,7 +368,7 @@ def _certainty(now: Standing) -> tuple[Finding, ...]:
     small = None
     if gain and waiting and waiting.id not in ran and now.incumbent is not None:
         small = beyond_one_trial(waiting, now.incumbent, now.missing)
-    return tuple(one for one in (gain and gain.to_finding(), small, now.less_in_log) if one)
+    return tuple(one for one in (gain and gain.to_finding(), small) if one)
 
 
 def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from grounded.search.standing import Proposal
 
 KIND = ".ended"
-LATEST = 4  # latest hand-outs that are looked at
 MODEL = "the model was changed"  # why a candidate is void
 UNSAID = (Ending.NOT_ALLOWED, Ending.GAINS)  # ends that are told with the refused candidate
 
@@ -54,13 +53,19 @@ def standing_in(
         GroundedError: if a stored file is damaged, or the task can't be planned.
     """
     contents = contents or workspace.read()
-    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-    task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    now = standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
+    now = standing_of(workspace, contents)
     workspace.save_index()
     if ahead and now.phase is Phase.PROPOSE and now.incumbent is not None:
         now = planned(workspace, contents).standing
     return answered(workspace, now)
+
+
+def standing_of(workspace: Folder, contents: Contents, without: Collection[str] = ()) -> Standing:
+    """Return the standing of the search by what a folder holds, without some trials."""
+    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
+    trials = [trial for trial in trials if trial.id not in without]
+    return standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
 
 
 def answered(workspace: Folder, now: Standing) -> Standing:
@@ -80,7 +85,7 @@ def planned(
 
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
     trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-    now = standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
+    now = standing_of(workspace, contents)
     planning = now.phase is Phase.PROPOSE and now.incumbent is not None
     if planning and (known := known_end(workspace, contents, now)) is not None:
         return Proposal(known, None, is_new=False)
@@ -227,14 +232,6 @@ def latest_candidates(workspace: Folder, most: int) -> tuple[list[Candidate], li
     return found
 
 
-def standing_without(workspace: Folder, ids: Collection[str]) -> Standing:
-    """Return the standing of the search without some trials."""
-    trials = [t for t in workspace.task_trials() if t.id not in ids]
-    task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    candidates = workspace.read().candidates
-    return standing(task, candidates, trials, options, planner.fingerprint, planner)
-
-
 def odd_run(
     workspace: Folder, now: Standing, identity: str, *, aside: bool = False
 ) -> tuple[Finding, ...]:
@@ -259,16 +256,3 @@ def _of(now: Standing, identity: str) -> Tried | None:
     """Return the candidate that a run is averaged into."""
     runs = ((tried, [trial.id for trial in tried.trials]) for tried in now.history)
     return next((tried for tried, ids in runs if identity in ids), None)
-
-
-def asked_again(workspace: Folder) -> str:
-    """Return the id of a candidate that was asked for, and handed out, but not run since; or ""."""
-    for name, after in reversed(workspace.noted.hand_outs[-LATEST:]):
-        number = int(after[1:].split("-")[0]) if after else 0
-        later = [t for t in workspace.trials() if t.stored.number > number]
-        if any(t.trial.candidate == name for t in later):
-            continue
-        waiting = standing_without(workspace, {t.stored.id for t in later}).outstanding
-        if waiting is not None and waiting.id == name:
-            return name
-    return ""

@@ -118,7 +118,7 @@ def _gain(made: Candidate) -> float:
     return 0.0 if gain is None else float(abs(gain).mean())
 
 
-def so_far(made: Candidate, best: Tried, missed: float) -> Finding:
+def so_far(made: Candidate, best: Tried) -> Finding:
     """Return the best one's utility and, if it differs clearly, what the model gives it.
 
     The gain of the candidate is counted from what the model gives the best one.
@@ -126,11 +126,9 @@ def so_far(made: Candidate, best: Tried, missed: float) -> Finding:
     Args:
         made: the candidate.
         best: the best one so far.
-        missed: cost of the sensor noise in its log that its prediction lacks.
     """
     own = best.candidate.id
     unlike = made.base == own and made.unlike(best.utility)
-    less = made.less_in_log(best, missed)
     gain = made.predicted_gain if unlike else None
     return found(
         "plan.so_far",
@@ -141,7 +139,7 @@ def so_far(made: Candidate, best: Tried, missed: float) -> Finding:
         noise=much_noise(best.noise_cost, best.utility),
         model=made.expected_of_base if unlike else None,
         gain=gain,
-    ).knowing({"log": less.facts["log"] if less else None})
+    )
 
 
 def much_noise(noise: float, utility: float) -> float | None:

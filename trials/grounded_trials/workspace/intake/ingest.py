@@ -35,7 +35,7 @@ from grounded_trials.workspace.candidates.search_state import (
     odd_run,
     overtaken,
     standing_in,
-    standing_without,
+    standing_of,
 )
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import refuse_ids, sha256
@@ -296,7 +296,7 @@ def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:
     again = trial.id not in [one.id for one in tried.trials[:repeats]]
     if not again or tried.accepted is None or tried.crashed:
         return tried.verdict()
-    before = standing_without(workspace, {trial.id})
+    before = standing_of(workspace, workspace.read(), {trial.id})
     if tried.accepted:
         again = any(t.accepted for t in before.history if t.candidate.id == tried.candidate.id)
     else:

@@ -22,7 +22,7 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
-from grounded_trials.workspace.candidates.search_state import asked_again, none_waits, standing_in
+from grounded_trials.workspace.candidates.search_state import none_waits, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
@@ -160,8 +160,6 @@ class NoneWaits(GroundedError):
 def outstanding(workspace: Folder, path: Path) -> str:
     """Return the candidate that waits for a trial, or raise that none does."""
     now = standing_in(workspace)
-    if now.outstanding is None and (asked := asked_again(workspace)):
-        return asked
     if now.outstanding is None:
         raise NoneWaits(workspace, path, now.incumbent.candidate.id if now.incumbent else "")
     return now.outstanding.id

@@ -20,7 +20,7 @@ from grounded.search.scatter import Repeats, sample_noise
 from grounded.search.starts import worth_of_start
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.workspace.candidates.search_state import standing_without
+from grounded_trials.workspace.candidates.search_state import standing_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.placing import FEWEST, placing
 
@@ -55,7 +55,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     cost = abs(task.utility(trial))
     if not np.isfinite(cost) or len(states) <= trial.finite_steps:
         cost = -own.predicted_utility
-    others = standing_without(workspace, {trial.id})
+    others = standing_of(workspace, workspace.read(), {trial.id})
     least = max(_scatter(others.history, cost), TOLD * cost)
     each = {int(i): abs(_changes(workspace, trial, off * (np.arange(len(off)) == i))) for i in far}
     told = sorted((i for i in each if each[i] > least), key=lambda i: -each[i])
@@ -101,7 +101,7 @@ def _inside(task: Task, states: Array) -> Array:
 
 def _to_repeat(workspace: Folder, trial: Trial) -> bool:
     """Return whether a run's candidate is to be run again since its start explains its loss."""
-    history = standing_without(workspace, ()).history
+    history = standing_of(workspace, workspace.read()).history
     return any(t.in_doubt and t.to_settle == t.candidate.id == trial.candidate for t in history)
 
 
