@@ -13,5 +13,4 @@ safety        checks a candidate before it is handed out
 pictures      figures of the search
 step/         the next step: its size, its direction, and the derivatives behind that
 feedback/     gains that a real robot bears: oscillation, noise, old samples
-told_trial    checks of a trial that came back, by `grounded.accounts.returned`
 """

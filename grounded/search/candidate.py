@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -15,6 +15,9 @@ from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.search.starts import Starts
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
@@ -40,22 +43,6 @@ UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their 
 # share of a gain or loss due to different start states from which on it is reported
 START_SHARE = 0.3
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
-
-
-class StartCosts(Protocol):
-    """What the start states of runs cost, by the model; see `Starts`."""
-
-    def owed(self, one: Tried, other: Tried) -> float:
-        """Return the part of the difference of two mean utilities that is due to the starts."""
-        ...
-
-    def cost(self, tried: Tried) -> float:
-        """Return what the starts of a candidate's runs cost on average."""
-        ...
-
-    def costs(self, tried: Tried) -> Array:
-        """Return what the start of each of a candidate's runs cost, (runs,)."""
-        ...
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -226,7 +213,7 @@ class Tried(Result):
     unsure: bool = False  # nothing is repeated, and runs may differ by as much as it gained
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
-    starts: StartCosts | None = None  # what the start states of its runs cost, by the model
+    starts: Starts | None = None  # what the start states of its runs cost, by the model
 
     @cached_property
     def utility(self) -> float:

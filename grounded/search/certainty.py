@@ -11,12 +11,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.difference import Difference
+from grounded.search.difference import LUCK, Difference
 from grounded.search.scatter import (
     NoiseSoFar,
-    Repeats,
     by_pieces,
-    by_states,
     explained_by_starts,
     noise_cost,
     noise_missed,
@@ -28,8 +26,6 @@ from grounded.trial import Trial, scattered
 if TYPE_CHECKING:
     from grounded.search.starts import Starts
     from grounded.search.step.step_size import SearchOptions
-
-ANOTHER = 99.0  # ratio of a state's costs in two runs that is no scatter, see `another_kind`
 
 
 def judged(
@@ -85,7 +81,7 @@ def judged(
             if (
                 options.rerun_incumbent
                 and not (spent or exact)
-                and in_doubt(task, incumbent, tried, history, most, once)
+                and in_doubt(incumbent, tried, history, most, once)
             ):
                 again = to_settle(incumbent, tried, most, once)
                 name = again.candidate.id if again else ""
@@ -128,28 +124,21 @@ def repeated_exactly(trials: Sequence[Trial]) -> bool:
 
 
 def in_doubt(
-    task: Task, incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int, once: int = 2
+    incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int, once: int = 2
 ) -> bool:
     """Return whether a loss may be due to a lucky trial of the incumbent, or to other start states.
 
     What different start states explain of it (`Tried.excused`) is no loss. A lucky incumbent would
     block every further step. So after a loss within two standard errors the incumbent is run again,
     until it has `most` trials: one for each loss; a loser whose starts explain it is, until it has
-    `once`. Without repeats at a similar utility, the standard deviation is taken as half of the
-    utility, as for chi-squared with eight degrees of freedom; a loss of more than 1.4 times the
-    best cost is then accepted at once, and one of more than 0.7 times if it is of another kind
-    (`another_kind`).
-    On a deterministic system this costs one trial per incumbent.
+    `once`. Without repeats at a similar utility a loss of more than 1.4 times the best cost is
+    accepted at once (`Difference.likely_error`). On a deterministic system this costs one trial per
+    incumbent.
     """
     if not np.isfinite(loser.utility) or to_settle(incumbent, loser, most, once) is None:
         return False
-    scatter = Repeats((*history, loser)).near(incumbent.utility)
-    each = math.sqrt(scatter.variance) if scatter.known else 0.5 * abs(incumbent.utility)
-    error = each * np.sqrt(1 / len(incumbent.trials) + 1 / len(loser.trials))
-    loss = -loser.gain_over(incumbent)
-    if not scatter.known and loss > error and another_kind(task, incumbent, loser):
-        return False
-    return not loss > 2 * error
+    lead = Difference(loser, incumbent, (*history, loser))
+    return not -loser.gain_over(incumbent) > LUCK * lead.likely_error
 
 
 def to_settle(incumbent: Tried, loser: Tried, most: int, once: int = 2) -> Tried | None:
@@ -164,17 +153,6 @@ def to_settle(incumbent: Tried, loser: Tried, most: int, once: int = 2) -> Tried
         either, cost = [(loser, min(once, most)), (incumbent, most)], loser.starts.cost
         either.sort(key=lambda one: -abs(cost(one[0])))
     return next((one for one, runs in either if len(one.trials) < runs), None)
-
-
-def another_kind(task: Task, incumbent: Tried, loser: Tried) -> bool:
-    """Return whether the error of one state explains a loss, and is no scatter of the incumbent's.
-
-    Even if a state's cost has only two degrees of freedom, as a single slow swing has, the ratio of
-    two such costs exceeds 99 by chance in 1 of 100 cases, F(2, 2): a tenfold error.
-    """
-    before, after = by_states(task, incumbent.trials), by_states(task, loser.trials)
-    rise, loss = after - before, incumbent.utility - loser.utility
-    return bool(((rise >= loss) & (after > ANOTHER * before)).any())
 
 
 def with_chances(history: Sequence[Tried]) -> tuple[Tried, ...]:

@@ -87,6 +87,15 @@ class Difference:
         return self._spread[0]
 
     @property
+    def likely_error(self) -> float:
+        """The error; while nothing was repeated, that of costs that scatter by half of their mean.
+
+        Costs that scatter as chi-squared with eight degrees of freedom do.
+        """
+        runs = 1 / len(self.before.utilities) + 1 / len(self.after.utilities)
+        return self.error if self.known else 0.5 * abs(self.after.utility) * math.sqrt(runs)
+
+    @property
     def freedom(self) -> float:
         """Degrees of freedom of the error; 0 if it is not known."""
         return self._spread[1]
@@ -97,12 +106,11 @@ class Difference:
 
         If no repeats are near the earlier candidate, the scatter of the later one is used for both.
         """
-        later = self.scatter
-        if not later.known:
+        later, runs = self.scatter, (len(self.before.utilities), len(self.after.utilities))
+        if not (later.known and all(runs)):
             return math.nan, 0.0
         earlier = self.repeats.near(self.before.utility)
         earlier = earlier if earlier.known else later
-        runs = len(self.before.utilities), len(self.after.utilities)
         squares = earlier.error(runs[0]) ** 2, later.error(runs[1]) ** 2
         error = math.sqrt(sum(squares))
         if earlier == later or not error:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
 from grounded.result import figure
 from grounded.search.candidate import Tried
+
+if TYPE_CHECKING:
+    from grounded.search.standing import Standing
 
 STEEP = 8.0  # ratio of worst to best utility from which on the axis is logarithmic
 MOST_DRAWN = 300  # most candidates that are drawn
@@ -24,25 +27,7 @@ OPEN = {  # labels of undecided verdicts
 OWN_PANEL_FROM = 4  # with more candidates than this, the better two thirds get a panel of their own
 
 
-class Drawn(Protocol):
-    """What is drawn of a `Standing`."""
-
-    @property
-    def history(self) -> tuple[Tried, ...]:
-        """All candidates with their trials."""
-        ...
-
-    @property
-    def incumbent(self) -> Tried | None:
-        """The best so far."""
-        ...
-
-    def verdict(self, tried: Tried) -> str:
-        """Return the verdict on a candidate."""
-        ...
-
-
-def search_figure(now: Drawn, optimum: float | None = None) -> Figure | None:
+def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     """Draw the utility of each candidate with the model's prediction, and the step sizes.
 
     Args:
@@ -101,7 +86,7 @@ def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
 
 
 def _utility(
-    now: Drawn, tried: list[Tried], number: dict[str, int], optimum: float | None
+    now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None
 ) -> Panel:
     dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
     rules, bands = [], []
@@ -196,7 +181,7 @@ def _undecided(verdicts: Sequence[str]) -> list[Key]:
     return [Key("predicted", " or ".join(names), "ring")] if names else []
 
 
-def _steps(now: Drawn, shown: list[Tried], number: dict[str, int]) -> Panel:
+def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
     """Draw the damping of each step, or alpha if a step was shortened or none was damped."""
     steps = [t for t in shown if t.candidate.iteration > 0]  # not the model's own policy
     damped = any(t.candidate.damping > 0 for t in steps)

@@ -20,7 +20,6 @@ import numpy as np
 
 from grounded.checks import known
 from grounded.compile import Problem, deepest
-from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.rollout import Rollout, simulate
@@ -35,6 +34,7 @@ if TYPE_CHECKING:
     from grounded.solve.ddp import Solution
 
 
+GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly (Weyl 1916)
 DEARER = (1.0, 10.0, 100.0, 1000.0)  # factors on the input weights for gains that are tried
 LOOSE = 64.0  # factor on the speed a dry friction builds up over: it then hardly damps
 
@@ -208,7 +208,7 @@ def model_fingerprint(task: Task) -> str:
     model, problem = task.model, task.problem(exact=True)
     digest = hashlib.sha256()
     digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
-    around = fixed_draws(8 * (model.n + model.m)) - 0.5
+    around = np.arange(1, 8 * (model.n + model.m) + 1) * GOLDEN % 1.0 - 0.5
     x = task.start + around[: 8 * model.n].reshape(8, model.n)
     u = task.past + around[8 * model.n :].reshape(8, model.m)
     u = np.clip(u, task.low, task.high)
@@ -217,22 +217,6 @@ def model_fingerprint(task: Task) -> str:
     for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
         digest.update(np.ascontiguousarray(array + 0.0).tobytes())
     return digest.hexdigest()[:16]
-
-
-def fixed_draws(count: int) -> Array:
-    """Return the first numbers in [0, 1) that `np.random.default_rng(0)` draws.
-
-    They are made here because to import numpy.random takes as long as many a plan. PCG64
-    (O'Neill 2014) is a linear congruence of 128 bits; its halves are combined and rotated.
-    """
-    state, step = 35399562948360463058890781895381311971, 87136372517582989555478159403783844777
-    found, low = [], 2**64 - 1
-    for _ in range(count):
-        state = (state * 0x2360ED051FC65DA44385DF649FCCF645 + step) % 2**128
-        mixed, turn = (state >> 64) ^ (state & low), state >> 122
-        mixed = (mixed >> turn | mixed << (64 - turn)) & low
-        found.append((mixed >> 11) * 2.0**-53)
-    return np.array(found)
 
 
 def predicted(problem: Problem, policy: Policy) -> Rollout:

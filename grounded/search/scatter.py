@@ -65,17 +65,6 @@ def by_pieces(task: Task, trials: Sequence[Trial]) -> Array:
     return np.array([[part.sum() for part in np.array_split(r, PIECES)] for r in worth])
 
 
-def by_states(task: Task, trials: Sequence[Trial]) -> Array:
-    """Return the mean cost of each state's distance to the target over runs, (n,)."""
-    reward, none = task.reward, np.zeros(task.model.m)
-    found = []
-    for only in np.eye(task.model.n):
-        state, terminal = only * reward.state, only * reward.terminal
-        alone = replace(reward, state=state, terminal=terminal, input=none, input_change=none)
-        found.append(-np.mean([task.rewards(trial, alone).sum() for trial in trials]))
-    return np.array(found)
-
-
 CHANCE = 3.0  # standard deviations of sensor noise by which one sample may differ
 SLOW_S, SLOWER = 0.1, 3.0  # [s] of second differences; times the white noise, at most
 WHITE = MEDIAN * 6**0.5  # median of absolute second differences of white noise of std 1

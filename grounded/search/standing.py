@@ -39,7 +39,6 @@ from grounded.search.difference import (
     runs_to_show,
 )
 from grounded.search.pictures import search_figure
-from grounded.search.scatter import Repeats
 from grounded.search.starts import Starts
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
@@ -328,10 +327,7 @@ def standing(
         return let_down(ended(now, *hardly), model)
     last = history[-1]
     crashed = last.candidate.id if last.accepted is False and last.failed else None
-    lost, more = _restarted(history, model)
-    improve = found(
-        "search.step", own, best=own, step=str(step), crashed=crashed, lost=lost, more=more
-    )
+    improve = found("search.step", own, best=own, step=str(step), crashed=crashed)
     now = replace(now, step=step, way=way, findings=(improve,))
     return now.with_finding(_suspicion(history, incumbent, model))
 
@@ -394,18 +390,6 @@ def _hardly(
         error=None if little else between.error,
         few=None if little else between.few,
     )
-
-
-def _restarted(history: tuple[Tried, ...], model: str) -> tuple[int | None, int | None]:
-    """Return after how many losses a search goes on because the model was changed, or None.
-
-    The second number is how many losses of its own then end the search.
-    """
-    row = list[Tried]()
-    for tried in history:
-        row = [] if tried.accepted else row + [tried] * tried.lost
-    own = sum(tried.candidate.model == model for tried in row)
-    return (None, None) if len(row) < PATIENCE or own >= LOST else (len(row), LOST)
 
 
 def _due(tried: Tried, best: Tried) -> float:
@@ -526,7 +510,7 @@ def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Find
     runs = runs_to_show(gap, best) if excused and best.deviation > 0 and gap > 0 else None
     runs = runs if runs and runs > MOST_RUNS_TOLD else None
     share = max(doubt.candidate.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
-    known = not excused and Repeats(now.history).near(best.utility).known
+    known = not excused and best.repeats > 0
     return found(
         "search.in_doubt",
         made.id,

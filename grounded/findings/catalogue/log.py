@@ -101,9 +101,8 @@ ENTRIES: dict[str, Entry] = {
     # columns: what [log] and names say
     "path": Entry(
         "warn",
-        OF + "{about} {about:is/are} read from [[{path}, {what}]][[: {instead} is the angle]]"
-        "[[{paths}: by their {by} they are exchanged]]",
-        "check {about:its path/their paths} in [log]",
+        OF + "{about} is read from {path}, {what}[[: {instead} is the angle]]",
+        "check its path in [log]",
     ),
     "stated": Entry(
         "warn",

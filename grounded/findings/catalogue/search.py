@@ -15,9 +15,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "step": Entry(
         "note",
-        "improve on {best} with {step}[[, since {crashed} crashed]][[; the last {lost} candidates "
-        "did not improve, but the model was changed since: {more} losses of its own end the "
-        "search]]",
+        "improve on {best} with {step}[[, since {crashed} crashed]]",
     ),
     # it waits
     "waiting": Entry("note", "{candidate} is waiting for {missing:trial}"),

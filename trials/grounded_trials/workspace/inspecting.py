@@ -18,7 +18,7 @@ from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import refuse_ids
-from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
+from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.user_files.config import FILE
 
 
@@ -114,7 +114,7 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
     states, inputs = assigned(report, model.states, model.inputs, model)
     table = mapping_toml(states, inputs, simulated=report.simulated, layout=layout)
     mapping = workspace.log_mapping
-    odd = tuple(one.sentence for one in no_angles(model, mapping))
+    odd = tuple(one.sentence for one in misread(model, mapping))
     known = {*mapping.states, *mapping.inputs} if mapping else set[str]()
     mapped = {*model.states, *model.inputs} <= known
     ran_nothing = not workspace.candidate_ids()

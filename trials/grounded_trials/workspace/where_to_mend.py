@@ -22,7 +22,7 @@ from grounded_trials.logs.log_files import digest_of
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.intake.opening.columns_by_name import no_angles
+from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.readings import UNCHANGED, Reading, readings_of
 from grounded_trials.workspace.user_files.task_file import seen_in
 
@@ -42,7 +42,7 @@ def where_to_mend(
     fed = workspace.config.task.feedback
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
     if read:
-        strange = no_angles(workspace.base_model, workspace.log_mapping)
+        strange = misread(workspace.base_model, workspace.log_mapping)
         odd = [Finding(one.about[0], one, "mismatch") for one in strange]
         by = readings_of(read[-1])
         whole = (replace(one, keys=_whole(one, by)) for one in (*odd, *findings))

@@ -9,7 +9,7 @@ second ingest finds the first.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,7 +24,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import Result
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.standing import Standing
+from grounded.search.standing import Phase, Standing
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
 from grounded_trials.logs.log_files import kind_of
@@ -81,7 +81,6 @@ class Ingested(Result):
     signals: tuple[SignalReport, ...]  # for a foreign log
     verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
     crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, if it crashed
-    to_settle: str = ""  # the candidate to be run again, if the verdict is "in doubt"
     mean: float = math.nan  # utility of the candidate's runs, by which it is judged
     runs: int = 0  # how many these are
     off_target: tuple[OffTarget, ...] = ()  # errors of the run, in units
@@ -193,36 +192,26 @@ def _as_logged(workspace: Folder, read: Read) -> bool:
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
     """Return the result for a trial that was just stored: findings, verdict, next command."""
-    workspace.forget_trials()
     trial = replace(read.trial, id=added.id)
     now = standing_in(workspace) if trial.candidate else None
-    history = now.history if now else ()
-    tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-    aside = added.id in workspace.discarded()
-    waits = now.outstanding if now and now.phase == "await-trial" else None
-    some = [*read.findings]
-    if before:
-        some.append(found("log.repeats", before, copy=others_differ(workspace)))
-    if aside:
-        some.append(found("log.aside", added.id, waits=waits.id if waits else ""))
-    if read.before:
-        some.append(read.before.finding(used=not aside))
-    if now:
-        some += _of_search(workspace, read, added, now)
-    some += _of_trial(workspace, read, trial)
-    some += filter(None, _of_run(workspace, read, trial, tried, history))
-    told = settle(some)
-    verdict = ASIDE if aside else _verdict(workspace, trial, tried)
+    run = (t for t in now.history if t.candidate.id == trial.candidate) if now else iter(())
+    stored = Stored(workspace, read, added.id, trial, now, next(run, None), before)
+    told = settle(one for one in stored.told() if one)
+    verdict = stored.verdict
     if ahead and verdict == "run again":
         now = standing_in(workspace, ahead=True)
-    _ask(workspace, read, added)
-    judged = [interpolate_gaps(trial).trial] if trial.candidate else []
-    if any(one.weight is Weight.ASIDE for one in told) and not aside:
+    if (why := read.to_set_aside) and not stored.aside:  # `status` can't tell it from the trial
+        note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": why.code}
+        with suppress(GroundedError):  # a folder that can't be written
+            workspace.notes.add(note, again=False)
+        vars(workspace).pop("noted", None)
+    if any(one.weight is Weight.ASIDE for one in told) and not stored.aside:
         then = NextCommand("discard", (added.id,))
-    elif now and waits and aside:
+    elif now and stored.aside and stored.waits:
         then = Situation(workspace, now).run
     else:
         then = after_log(workspace, verdict, now)
+    tried, judged = stored.tried, [interpolate_gaps(trial).trial] * bool(trial.candidate)
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -233,7 +222,6 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         findings=told,
         signals=read.signals,
         verdict=verdict,
-        to_settle=tried.to_settle if tried else "",
         mean=tried.utility if tried else math.nan,
         runs=len(tried.trials) if tried else 0,
         crashed=tried.failed if tried and verdict == "crashed" else (),
@@ -242,67 +230,80 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     )
 
 
-def _of_trial(workspace: Folder, read: Read, trial: Trial) -> Iterator[Finding]:
-    """Yield what the columns and the start of a trial show, and what it lacks."""
-    yield from log_faults(workspace, interpolate_gaps(trial).trial, own=read.own)
-    if begun := begun_elsewhere(workspace, trial):
-        yield begun
-    yield from _checked(workspace, trial, read.last_s)
+@dataclass(frozen=True, eq=False)
+class Stored:
+    """A trial that was just stored, and the search that has it.
 
+    Args:
+        workspace: the workspace with the task and the candidates.
+        read: how it was read.
+        id: its name.
+        trial: the same trial, with that name.
+        now: the standing of the search; None for data.
+        tried: its candidate with all of its runs; None for data, or of another task.
+        before: the trial that it repeats to the last bit, or "".
+    """
 
-def _of_run(
-    workspace: Folder,
-    read: Read,
-    trial: Trial,
-    tried: Tried | None,
-    history: Sequence[Tried],
-) -> Iterator[Finding | None]:
-    """Yield how a candidate was run, and how its run went."""
-    if not read.doubted:
-        yield ran_otherwise(workspace, trial)
-    yield gone_wrong(workspace, interpolate_gaps(trial).trial, tried, history)
-    yield ended_early(workspace, trial, read.silent)
+    workspace: Folder
+    read: Read
+    id: str
+    trial: Trial
+    now: Standing | None
+    tried: Tried | None
+    before: str
 
+    @property
+    def aside(self) -> bool:
+        """Whether it is set aside."""
+        return self.id in self.workspace.discarded()
 
-def _of_search(workspace: Folder, read: Read, added: Added, now: Standing) -> Iterator[Finding]:
-    """Yield what a run changed in the search, and that it is judged by another model."""
-    if changed := overtaken(workspace, ran=True):
-        yield changed.weighing(Weight.WARN)
-    if read.doubted and added.id not in workspace.discarded():
-        yield from odd_run(workspace, now, added.id, aside=_aside(read))
+    @property
+    def waits(self) -> str:
+        """The candidate that waits for a trial, or ""."""
+        waiting = self.now and self.now.phase is Phase.AWAIT and self.now.outstanding
+        return waiting.id if waiting else ""
 
+    def told(self) -> Iterator[Finding | None]:
+        """Yield what is to be known: of the log, the search, the columns and the run."""
+        here, read, trial = self.workspace, self.read, self.trial
+        yield from read.findings
+        if self.before:
+            yield found("log.repeats", self.before, copy=others_differ(here))
+        if self.aside:
+            yield found("log.aside", self.id, waits=self.waits)
+        if read.before:
+            yield read.before.finding(used=not self.aside)
+        if self.now and (changed := overtaken(here, ran=True)):
+            yield changed.weighing(Weight.WARN)
+        if self.now and read.doubted and not self.aside:
+            yield from odd_run(here, self.now, self.id, aside=read.to_set_aside is not None)
+        whole = interpolate_gaps(trial).trial
+        yield from log_faults(here, whole, own=read.own)
+        yield begun_elsewhere(here, trial)
+        yield from _checked(here, trial, read.last_s)
+        if not read.doubted:
+            yield ran_otherwise(here, trial)
+        yield gone_wrong(here, whole, self.tried, self.now.history if self.now else ())
+        yield ended_early(here, trial, read.silent)
 
-def _aside(read: Read) -> bool:
-    """Return whether a log that ran no candidate as it should was taken as its run."""
-    return read.doubted and any(one.weight is Weight.ASIDE for one in read.findings)
-
-
-def _ask(workspace: Folder, read: Read, added: Added) -> None:
-    """Note that such a run is to be set aside: `status` can't tell it from the stored trial."""
-    if not _aside(read) or added.id in workspace.discarded():
-        return
-    why = next(one.code for one in read.findings if one.weight is Weight.ASIDE)
-    note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": why}
-    with suppress(GroundedError):  # a folder that can't be written
-        workspace.notes.add(note, again=False)
-    vars(workspace).pop("noted", None)
-
-
-def _verdict(workspace: Folder, trial: Trial, tried: Tried | None) -> str:
-    """Return the verdict on a run; "run again" for another one of what was a best before it."""
-    if tried is None:
-        return "probe" if trial.candidate else ""
-    repeats = workspace.config.search.repeats
-    again = trial.id not in [one.id for one in tried.trials[:repeats]]
-    if not again or tried.accepted is None or tried.crashed:
-        return tried.verdict()
-    before = standing_of(workspace, workspace.read(), {trial.id})
-    if tried.accepted:
-        again = any(t.accepted for t in before.history if t.candidate.id == tried.candidate.id)
-    else:
-        best = before.incumbent
-        again = best is not None and best.candidate.id == tried.candidate.id
-    return "run again" if again else tried.verdict()
+    @property
+    def verdict(self) -> str:
+        """The verdict on the run; "run again" for another one of what was the best before it."""
+        tried, repeats = self.tried, self.workspace.config.search.repeats
+        if self.aside:
+            return ASIDE
+        if tried is None:
+            return "probe" if self.trial.candidate else ""
+        first = [one.id for one in tried.trials[:repeats]]
+        if self.id in first or tried.accepted is None or tried.crashed:
+            return tried.verdict()
+        before = standing_of(self.workspace, self.workspace.read(), {self.id})
+        if tried.accepted:
+            was = any(t.accepted for t in before.history if t.candidate.id == tried.candidate.id)
+        else:
+            best = before.incumbent
+            was = best is not None and best.candidate.id == tried.candidate.id
+        return "run again" if was else tried.verdict()
 
 
 # --- what a trial lacks or exceeds ---------------------------------------------------------------

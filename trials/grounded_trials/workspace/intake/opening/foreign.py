@@ -38,7 +38,7 @@ from grounded_trials.workspace.identity import (
     ROWS,
     StoredTrial,
 )
-from grounded_trials.workspace.intake.opening.columns_by_name import crossed, no_angles
+from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
     read_estimate,
@@ -54,7 +54,6 @@ from grounded_trials.workspace.intake.opening.reading import (
 from grounded_trials.workspace.intake.opening.run_start import Recording, recording
 from grounded_trials.workspace.intake.opening.stored_before import (
     refuse_as_another,
-    refuse_known_data,
     set_aside_of,
 )
 from grounded_trials.workspace.readings import read_by, twice_in_time
@@ -347,12 +346,6 @@ def begun(grid: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[Finding]:
         yield found("start.interval", *(one.name for one in slow), every=every, dt=dt)
 
 
-def misread(log: ForeignLog) -> list[Finding]:
-    """Return the signals that are read from each other's column, or angles from something else."""
-    model = log.workspace.base_model
-    return [*crossed(model, log.mapping), *no_angles(model, log.mapping)]
-
-
 # --- the trial in it ------------------------------------------------------------------------------
 
 
@@ -374,8 +367,6 @@ def read_log_file(
     log = read_foreign(workspace, path, mapping_of(workspace, path).since(sent_before))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(workspace, path, log.stored, "" if data else candidate)
-    if not (data or ran):
-        refuse_known_data(workspace, path, log.stored, None)
     before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
     if before and before.candidate in workspace.candidate_ids():
         ran = before.candidate
@@ -400,7 +391,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         trial,
         encoded,
         (
-            *misread(log),
+            *misread(log.workspace.base_model, log.mapping),
             *log.unlike_units,
             *log.unread,
             *remarks,

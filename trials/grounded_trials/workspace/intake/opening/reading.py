@@ -69,6 +69,12 @@ class Read:
         return self.log is None and not self.copy
 
     @property
+    def to_set_aside(self) -> Finding | None:
+        """Why a log that ran no candidate as it should, taken as its run, is to be set aside."""
+        asked = (one for one in self.findings if one.weight is Weight.ASIDE)
+        return next(asked, None) if self.doubted else None
+
+    @property
     def silent(self) -> tuple[str, ...]:
         """The states without a value from the end of the trial on, though its log goes on."""
         if self.log is None or self.cut is None:

@@ -17,6 +17,7 @@ import numpy as np
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, found
+from grounded.search.standing import Phase
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files, on_disk
 from grounded_trials.logs.resample import ABSOLUTE_S
@@ -38,46 +39,32 @@ def refuse_as_another(
 ) -> None:
     """Refuse a log that is stored as a run of another candidate, or as data.
 
+    The log of data was most likely passed by mistake, and a diagnosis may rest on it: only who
+    names a candidate is told to discard it.
+
     Args:
         workspace: the workspace with the search.
         path: the log.
         stored: the trials that were made from it.
-        wanted: the requested candidate, "" for data, None for no preference.
+        wanted: the requested candidate, "" for data, None for any run.
 
     Raises:
-        GroundedError: if it is stored as something else, with the trial to discard.
+        GroundedError: if it is stored as something else, with what to do instead.
     """
-    if not stored or wanted in (None, *(one.trial.candidate for one in stored)):
+    ran = [one.trial.candidate for one in stored]
+    if not ran or wanted in ran or (wanted is None and ran[-1]):
         return
-    identity, as_run = stored[-1].stored.id, stored[-1].trial.candidate
-    refuse_known_data(
-        workspace, path, stored, wanted
-    )  # the wrong file, most likely; a diagnosis may rest on it
-    facts = {"used": as_run or "data", "wanted": wanted or "data"}
-    then = NextCommand("discard", (identity,))
-    raise refused("log.stored", path, trial=identity, then=then, **facts)
-
-
-def refuse_known_data(
-    workspace: Folder, path: Path, stored: Sequence[StoredTrial], wanted: str | None
-) -> None:
-    """Refuse a log that is stored as data and was passed as the log of a run, probably by mistake.
-
-    Only who names the candidate is told to discard the data: a diagnosis may rest on it.
-
-    Raises:
-        GroundedError: if it is stored as data.
-    """
-    if not stored or stored[-1].trial.candidate:
-        return
-    identity, now = stored[-1].stored.id, standing_in(workspace)
-    waits = now.outstanding.id if now.outstanding and now.phase == "await-trial" else ""
-    then = to_run(workspace, waits) if waits else NextCommand("status")
-    if wanted:
-        facts = {"used": "data", "wanted": wanted, "waits": waits or wanted, "both": 1}
-        raise refused("log.stored", path, trial=identity, then=then, **facts)
-    facts = {"used": "data", "waits": waits}
-    raise refused("log.stored", path, trial=identity, then=then, **facts)
+    identity = stored[-1].stored.id
+    if ran[-1]:
+        facts, then = {"wanted": wanted or "data"}, NextCommand("discard", (identity,))
+    else:
+        now = standing_in(workspace)
+        waits = now.outstanding.id if now.outstanding and now.phase is Phase.AWAIT else ""
+        then = to_run(workspace, waits) if waits else NextCommand("status")
+        facts = {"waits": waits}
+        if wanted:
+            facts = {"wanted": wanted, "waits": waits or wanted, "both": "1"}
+    raise refused("log.stored", path, trial=identity, then=then, used=ran[-1] or "data", **facts)
 
 
 @dataclass(frozen=True)
@@ -134,7 +121,7 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     names = tuple(name for name, (a, b) in spans.items() if a < end and start < b)
     if not names:
         return data  # another part of a long recording
-    raise _read_otherwise(log.path, names)
+    raise refused("log.stored", log.path, trial=names, other=1, then=NextCommand("discard", names))
 
 
 def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[Finding, ...]:
@@ -150,10 +137,6 @@ def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[Finding, ..
     trials = tuple(one.stored.id for one in other)
     states = log.source["estimated"].split(",")
     return (found("log.estimated", *states, now=has, before=had, trials=trials),)
-
-
-def _read_otherwise(path: Path, names: tuple[str, ...]) -> GroundedError:
-    return refused("log.stored", path, trial=names, other=1, then=NextCommand("discard", names))
 
 
 def same_recording(
@@ -193,11 +176,11 @@ def same_recording(
         stamped = first > ABSOLUTE_S  # absolute time; else the clock of each log may start at zero
         if alike == "none" or (alike == "some" and not stamped):
             continue
-        if alike == "some":
-            raise _read_otherwise(path, (one.stored.id,))
-        if here.finite_steps > one.measured.finite_steps:
-            then = NextCommand("discard", (one.stored.id,))
-            raise refused("log.stored", path, trial=one.stored.id, part=1, then=then)
+        identity, more = one.stored.id, here.finite_steps > one.measured.finite_steps
+        if alike == "some" or more:
+            how = {"other": 1} if alike == "some" else {"part": 1}
+            then = NextCommand("discard", (identity,))
+            raise refused("log.stored", path, trial=identity, then=then, **how)
         lasted = one.meta.get(LASTED)
         cut = lasted is not None and log is not None and lasted != log.source[LASTED]
         if stamped or cut or here.finite_steps < one.measured.finite_steps:

@@ -44,10 +44,10 @@ from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
+from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.intake.opening.foreign import (
     cut_log,
     cut_short,
-    misread,
     read_log_file,
 )
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
@@ -378,7 +378,8 @@ def _of_motion(case: Case, story: Story) -> Iterator[Story]:
 
 def _of_columns(case: Case, odd: Sequence[Finding]) -> Iterator[Story]:
     """Yield the faults of columns that motion and kinematics show."""
-    names = misread(case.read.log) if case.read.log else []
+    log = case.read.log
+    names = misread(case.task.model, log.mapping) if log else []
     if every := [*names, *odd]:
         yield Story(Kind.LOG, every[0], commands=-np.inf)
 
