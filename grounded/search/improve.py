@@ -35,7 +35,7 @@ from grounded.model import Model
 from grounded.search.candidate import BY_STEP, Candidate, Tried
 from grounded.search.difference import few, one_trial_error
 from grounded.search.making import About, Maker
-from grounded.search.original import keeping_promises
+from grounded.search.original import trusted
 from grounded.search.planner import Planner
 from grounded.search.standing import (
     DIAGNOSE,
@@ -215,7 +215,7 @@ def _step(about: About, due: Step, promised: list[float]) -> tuple[About, Propos
         due: the first step to try.
         promised: predicted gains that were too small are appended to it.
     """
-    make, base, by = about.make, about.incumbent.candidate, keeping_promises(about)
+    make, base, by = about.make, about.incumbent.candidate, trusted(about)
     goes_on = base.way == BY_STEP and base.model == make.fingerprint
     first = about.way == make.now.way
     by_step = _by_step(by) if first and goes_on else None
