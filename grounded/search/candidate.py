@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
-    "recorded inputs",  # the same with the paper's bias alone (`bias`: no matched inputs)
     "slopes by step",  # with derivatives corrected step by step (`by_step`)
     "gentler gains",  # the incumbent's plan with lower gains (`Maker.gentler`)
     "own plan",  # the plan of a model changed since the incumbent was planned (`About.own_plan`)
@@ -85,7 +84,7 @@ class Candidate(Result):
     @property
     def grounded(self) -> bool:
         """Whether it is a step along a direction, predicted by a model that replays a trial."""
-        return bool(self.base) and self.way in ("", "recorded inputs", BY_STEP)
+        return bool(self.base) and self.way in ("", BY_STEP)
 
     @property
     def of_model_alone(self) -> bool:

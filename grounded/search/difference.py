@@ -88,12 +88,14 @@ class Difference:
 
     @property
     def likely_error(self) -> float:
-        """The error; while nothing was repeated, that of costs that scatter by half of their mean.
+        """The standard error if `before` scatters as `after` does, since a poor policy says little.
 
-        Costs that scatter as chi-squared with eight degrees of freedom do.
+        While nothing was repeated, by half of the cost, as chi-squared with eight degrees of
+        freedom does.
         """
+        near, cost = self.scatter, abs(self.after.utility)
         runs = 1 / len(self.before.utilities) + 1 / len(self.after.utilities)
-        return self.error if self.known else 0.5 * abs(self.after.utility) * math.sqrt(runs)
+        return math.sqrt(runs * near.variance) if near.known else 0.5 * cost * math.sqrt(runs)
 
     @property
     def freedom(self) -> float:

@@ -23,7 +23,7 @@ bit. `ask_tell` has the loop around it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -155,22 +155,6 @@ def refitted(task: Task, trials: Sequence[Trial]) -> Model:
     return task.model if found.worse else found.model
 
 
-@dataclass
-class _Rejected:
-    """What the ways came to that made no step worth a trial."""
-
-    promised: list[float] = field(default_factory=list)  # gains that were too small
-    least: float = 0.0  # gain from which a step is worth a trial
-    unsafe: Proposal | None = None
-    ruinous: Candidate | None = None
-    doubted: Candidate | None = None
-
-    @property
-    def at_optimum(self) -> bool:
-        """Whether the model promises no more than it would by chance."""
-        return bool(self.promised) and 0 <= max(self.promised) <= self.least
-
-
 def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Proposal:
     """Steps 4 to 6: propose the first step, from the due one on, that gains in the model.
 
@@ -178,53 +162,35 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     predicted run loses is skipped without a trial: d must satisfy
     U^(theta + alpha d) >= U^(theta) for some alpha (step 5).
     """
-    now, ways, rejected = make.now, options.ways(incumbent.candidate), _Rejected()
     if (made := make.gentler(incumbent)) is not None:
         return make.checked(made)
-    lost = _steps_lost(make, incumbent.candidate.id)
-    for way in ways[ways.index(now.way) :]:
-        due = now.step
-        if way != now.way:
-            due = options.due(now.history, incumbent, make.fingerprint, way)
-        if due is None:
-            continue
 
-        # Steps 4 and 5, and the plan of a model that was changed since the best trial.
-        about = About(make, incumbent, options, way)
-        by, proposal = _step(about, due, rejected.promised)
-        if way == ways[0]:
-            proposal = about.own_plan(proposal) or proposal
-        if proposal is not None and proposal.candidate is not None:
-            noise = _below_noise(make, incumbent, proposal.candidate, options)
-            return proposal if noise is None else Proposal(noise, None, False)
+    # Steps 4 and 5, and the plan of a model that was changed since the best trial.
+    about = About(make, incumbent, options)
+    by, proposal = _step(about)
+    proposal = about.own_plan(proposal) or proposal
 
-        # No trial is spent on another way in doubt, or at the model's optimum.
-        rejected.least, rejected.doubted = by.least, by.doubted
-        rejected.unsafe = rejected.unsafe or proposal
-        rejected.ruinous = rejected.ruinous or by.ruinous
-        if by.doubted is not None or (rejected.at_optimum and not lost):
-            break
-    return rejected.unsafe or Proposal(_ended(make, incumbent, rejected, options), None, False)
+    # Step 7: no step is worth a trial.
+    if proposal is None:
+        return Proposal(_ended(make, incumbent, by, options), None, False)
+    if proposal.candidate is not None:
+        noise = _below_noise(make, incumbent, proposal.candidate, options)
+        return proposal if noise is None else Proposal(noise, None, False)
+    return proposal
 
 
-def _step(about: About, due: Step, promised: list[float]) -> tuple[About, Proposal | None]:
-    """Return the step of one way, and the grounded model that makes it.
-
-    Args:
-        about: the current model grounded on the incumbent's trial.
-        due: the first step to try.
-        promised: predicted gains that were too small are appended to it.
-    """
-    make, base, by = about.make, about.incumbent.candidate, trusted(about)
+def _step(about: About) -> tuple[About, Proposal | None]:
+    """Return the due step, and the grounded model that makes it."""
+    make, base, by, due = about.make, about.incumbent.candidate, trusted(about), about.make.now.step
+    assert due is not None
     goes_on = base.way == BY_STEP and base.model == make.fingerprint
-    first = about.way == make.now.way
-    by_step = _by_step(by) if first and goes_on else None
-    made = by_step or by.step_from(due, promised)
+    by_step = _by_step(by) if goes_on else None
+    made = by_step or by.step_from(due)
     if by is not about and made and made.candidate and about.ruined_by(made.candidate):
-        by, made = about, about.step_from(due, promised)
+        by, made = about, about.step_from(due)
     if by.corrected and made and made.candidate and not by_step:
         made = _surer(by, due, made)
-    if first and not goes_on and (by_step := _by_step(by)) is not None:
+    if not goes_on and (by_step := _by_step(by)) is not None:
         made = _promising(made, by_step)
     return by, made
 
@@ -274,8 +240,8 @@ def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
     assert made is not None
     if not made.expected_gain < RISKY * about.incumbent.utility:
         return corrected
-    own = About(about.make, about.incumbent, about.options, about.way, about.original, plainly=True)
-    found = own.step_from(step, [])
+    own = About(about.make, about.incumbent, about.options, original=about.original, plainly=True)
+    found = own.step_from(step)
     if own.doubted is not None:
         about.doubted = own.doubted
         return None
@@ -291,7 +257,7 @@ def _by_step(about: About) -> Proposal | None:
     if step is None:
         return None
     stepping = About(make, about.incumbent, options, BY_STEP, about.original)
-    found = stepping.step_from(step, []) if stepping.corrected else None
+    found = stepping.step_from(step) if stepping.corrected else None
     return found if found and found.candidate else None
 
 
@@ -304,7 +270,7 @@ def _promising(found: Proposal | None, other: Proposal) -> Proposal:
     return other if better else found
 
 
-def _ended(make: Maker, incumbent: Tried, rejected: _Rejected, options: SearchOptions) -> Standing:
+def _ended(make: Maker, incumbent: Tried, rejected: About, options: SearchOptions) -> Standing:
     """Return the standing of a search in which no step is worth a trial, with the reason."""
     own, doubted = incumbent.candidate.id, rejected.doubted
     finite = [gain for gain in rejected.promised if np.isfinite(gain)]

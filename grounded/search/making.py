@@ -77,7 +77,7 @@ class About:
         make: Maker,
         incumbent: Tried,
         options: SearchOptions,
-        way: Way,
+        way: Way = "",
         original: bool = False,
         plainly: bool = False,
     ) -> None:
@@ -87,8 +87,7 @@ class About:
         said = incumbent.candidate.predicted_states
         own = planner.lift(begun_at(planner.task, incumbent.trials, said))
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
-        matched = options.match_inputs and way != "recorded inputs"
-        self.grounding = ground(plan, own, match_inputs=matched)
+        self.grounding = ground(plan, own, match_inputs=options.match_inputs)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         # without a bias: independent of noise and start
         age = planned_age(planner.task, incumbent, make.ages)
@@ -117,6 +116,7 @@ class About:
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
+        self.promised: list[float] = []  # gains of steps that were too small
         self.ruinous: Candidate | None = None  # a step rejected because of its predicted loss
         self.doubted: Candidate | None = None  # the next step after two losses
 
@@ -172,7 +172,7 @@ class About:
         moved = apart(self.real, (made.predicted_states, made.predicted_inputs), self.run)
         return replace(made, likely_off=self.missed * moved)
 
-    def step_from(self, first: Step, promised: list[float]) -> Proposal | None:
+    def step_from(self, first: Step) -> Proposal | None:
         """Return the first step worth a trial, else one that is not allowed, else None.
 
         A step whose likely error exceeds its gain is only used if there is no other. If two steps
@@ -183,7 +183,6 @@ class About:
 
         Args:
             first: the due step, regardless of the derivatives of those that lost.
-            promised: predicted gains that were too small are appended to it.
         """
         make, options = self.make, self.options
         history, model = make.now.history, make.fingerprint
@@ -227,7 +226,7 @@ class About:
                 else:
                     doubted = doubted or proposal
                 continue
-            promised.append(made.predicted_gain)
+            self.promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
         return doubted or unsafe

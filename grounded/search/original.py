@@ -43,7 +43,7 @@ def trusted(about: About) -> About:
     if not lost or tells_better(planner, bare, lost):
         return about
     crude = replace(make, planner=bare.feeding_back(t.candidate.policy for t in history))
-    original = About(crude, about.incumbent, about.options, about.way, original=True)
+    original = About(crude, about.incumbent, about.options, original=True)
     off = abs(original.already - about.incumbent.utility)
     return original if off < FORETOLD * -about.incumbent.utility else about
 

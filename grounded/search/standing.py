@@ -28,7 +28,7 @@ from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
-from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried, Way
+from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.certainty import judged
 from grounded.search.difference import (
     LUCK,
@@ -102,7 +102,6 @@ class Standing(Result):
     outstanding: Candidate | None
     missing: int  # trials that the outstanding candidate still needs
     step: Step | None  # the next step, if a candidate is to be made
-    way: Way
     caution: int
     history: tuple[Tried, ...]
     trials: int
@@ -303,7 +302,6 @@ def standing(
         outstanding=None,
         missing=0,
         step=None,
-        way="",
         caution=0,
         history=history,
         trials=total,
@@ -318,7 +316,7 @@ def standing(
     if incumbent is None:
         return _none_stood(now, options, model)
     own = incumbent.candidate.id
-    step, way = _next_step(history, incumbent, options, model)
+    step = options.due(history, incumbent, model)
     if step is None:
         alpha = 2.0**-options.max_halvings
         least = found("search.no_step", own, best=own, alpha=alpha)
@@ -328,7 +326,7 @@ def standing(
     last = history[-1]
     crashed = last.candidate.id if last.accepted is False and last.failed else None
     improve = found("search.step", own, best=own, step=str(step), crashed=crashed)
-    now = replace(now, step=step, way=way, findings=(improve,))
+    now = replace(now, step=step, findings=(improve,))
     return now.with_finding(_suspicion(history, incumbent, model))
 
 
@@ -543,14 +541,3 @@ def _waiting(now: Standing, model: str) -> Tried | None:
         if made.base not in undecided and (made.base or made.caution <= failed):
             return tried
     return None
-
-
-def _next_step(
-    history: tuple[Tried, ...], incumbent: Tried, options: SearchOptions, model: str
-) -> tuple[Step | None, Way]:
-    """Return the next step after the trials so far, and the way to make its direction."""
-    ways = options.ways(incumbent.candidate)
-    for way in ways:
-        if (step := options.due(history, incumbent, model, way)) is not None:
-            return step, way
-    return None, ways[-1]

@@ -19,7 +19,7 @@ def test_a_step_without_the_adopted_delay_is_not_run(monkeypatch, delay=0.1, noi
         make = replace(
             about.make, planner=Planner(about.make.planner.task, about.make.planner.task)
         )
-        return About(make, about.incumbent, about.options, about.way, original=True)
+        return About(make, about.incumbent, about.options, original=True)
 
     monkeypatch.setattr(improve, "trusted", bare)
     reward = Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([1e-4]), np.array([1e-4]))

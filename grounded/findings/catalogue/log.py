@@ -115,11 +115,6 @@ ENTRIES: dict[str, Entry] = {
         "place",
         "to use it, add {about} = its scatter at standstill there",
     ),
-    "estimated": Entry(
-        "note",
-        "the model that estimates {about} has {now}; for {trials} it had {before}",
-        "to have all from one model, discard {trials} and ingest the logs again",
-    ),
     "limits": Entry(
         "warn",
         "{about} goes [[from {logged}]][[up to {most}]] beyond its [limits][[, {limits}]] in this "

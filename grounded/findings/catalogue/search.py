@@ -96,8 +96,7 @@ ENTRIES: dict[str, Entry] = {
     "uncounted": Entry(
         "note",
         "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "
-        "[[another policy that is also called {candidate}]][[!candidate? candidates of another "
-        "task, or probes]]",
+        "another task's candidate, a probe, or another policy of a candidate's name",
     ),
     "left_out": Entry(
         "note",

@@ -50,8 +50,7 @@ BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all
 Method = Literal["ddp", "policy-gradient"]
 Stepping = Literal["damped", "full"]
 METHODS, STEPS = get_args(Method), get_args(Stepping)
-OTHERS = 2  # losses from a candidate before its derivatives are corrected step by step
-OTHER_WAY = 2  # losses of the way that comes second, before it is given up
+OTHERS = 2  # losses from a candidate before its derivatives are corrected step by step, and after
 
 
 @dataclass(frozen=True)
@@ -157,22 +156,15 @@ class SearchOptions:
         """Return the step after one that did not improve; None if no smaller one is left."""
         return after_failure(step, self.max_halvings, damps=self.damps)
 
-    def ways(self, incumbent: Candidate) -> tuple[Way, ...]:
-        """Return the ways to make a direction, first the one that made the incumbent."""
-        if not (self.damps and self.match_inputs):
-            return ("",)
-        recorded = incumbent.way == "recorded inputs"
-        return ("recorded inputs", "") if recorded else ("", "recorded inputs")
-
     def due(
         self,
         history: Sequence[Tried],
         incumbent: Tried,
         model: str,
-        way: Way,
+        way: Way = "",
         slopes: Slopes | None = None,
     ) -> Step | None:
-        """Return the next step from the incumbent in one way; None if the way is exhausted.
+        """Return the next step from the incumbent, made in one way; None if that is exhausted.
 
         Only losses of the same model (and of the same kind of derivatives, `slopes`, if given)
         count: a direction belongs to one model.
@@ -182,14 +174,12 @@ class SearchOptions:
         goes_on = made.way == way and made.model == model
         if way == BY_STEP:
             enough = goes_on or len(losers_of(history, made.id, model)) >= OTHERS
-            if not (self.damps and self.slopes_by_step and enough):
+            used_up = len(losers) >= OTHERS and not goes_on
+            scatters = incumbent.standard_error > 0  # one way is enough to be told from luck
+            if scatters or used_up or not (self.damps and self.slopes_by_step and enough):
                 return None
         if slopes is not None:
             losers = [candidate for candidate in losers if candidate.slopes == slopes]
-        if way != self.ways(made)[0] and (
-            incumbent.standard_error > 0 or (len(losers) >= OTHER_WAY and not goes_on)
-        ):
-            return None  # where trials scatter, one way is enough to be told from luck
         if losers:
             return self.next_step(Step(losers[-1].damping, losers[-1].alpha))
         base = next((t for t in history if t.candidate.id == made.base), None)

@@ -324,7 +324,6 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *([lost.weighing(Weight.NOTE)] if lost else []),
         *gone,
         *filter(None, [overtaken(workspace)]),
-        *_namesakes(workspace),
         *not_counted(uncounted(workspace, workspace.trials(), standing)),
         *left_out(workspace),
         *here.since.findings,
@@ -407,28 +406,16 @@ def undecided(now: Standing, trial: str) -> Standing:
 
 
 def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:
-    """Return trials of this model that ran no candidate of the search: of another task, or probes.
+    """Return trials of this model that ran no candidate of the search.
 
-    Trials of another policy with the name of a candidate (see `_namesakes`) are left out.
+    They ran one of another task, a probe, or another policy with the name of a candidate, after two
+    folders were merged.
     """
     own = {tried.candidate.id for tried in now.history}
-    ran = [t for t in trials if t.trial.candidate and workspace.fits(t.trial)]
-    return [
-        t.stored.id for t in ran if "~" not in t.trial.candidate and t.trial.candidate not in own
-    ]
+    ran = [one for one in trials if one.trial.candidate and workspace.fits(one.trial)]
+    return [one.stored.id for one in ran if one.trial.candidate not in own]
 
 
 def not_counted(names: Sequence[str]) -> list[Finding]:
     """Return that these trials only serve fit and diagnose; [] for none."""
     return [found("search.uncounted", *names)] if names else []
-
-
-def _namesakes(workspace: Folder) -> list[Finding]:
-    """Report trials that ran another policy of a candidate's name (after merging two folders)."""
-    names: dict[str, list[str]] = {}
-    for one in workspace.trials():
-        if "~" in one.trial.candidate:
-            names.setdefault(one.trial.candidate, []).append(one.stored.id)
-    return [
-        found("search.uncounted", *ids, candidate=name.split("~")[0]) for name, ids in names.items()
-    ]

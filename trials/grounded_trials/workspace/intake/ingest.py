@@ -47,7 +47,6 @@ from grounded_trials.workspace.intake.opening.reading import (
 )
 from grounded_trials.workspace.intake.opening.stored_before import (
     as_stored,
-    estimated_otherwise,
     others_differ,
     repeated,
 )
@@ -163,8 +162,6 @@ def ingest_log(
         from grounded_trials.workspace.intake.recognising.recognise import recognised
 
         read = recognised(workspace, path, read, candidate)
-    if read.log:
-        read = read.telling(*estimated_otherwise(workspace, read.log))
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
     before = "" if read.copy else repeated(workspace, path, read.trial, read.data)

@@ -124,21 +124,6 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     raise refused("log.stored", log.path, trial=names, other=1, then=NextCommand("discard", names))
 
 
-def estimated_otherwise(workspace: Folder, log: ForeignLog) -> tuple[Finding, ...]:
-    """Return that the latest estimated trials were estimated with another model, if so."""
-    if (now := log.source.get(ESTIMATED_WITH)) is None:
-        return ()
-    known = [one for one in workspace.whole_trials() if one.meta.get("estimated")]
-    other = [one for one in known if one.meta.get(ESTIMATED_WITH, "") != now]
-    if not other or known[-1] is not other[-1]:
-        return ()
-    before = other[-1].meta.get(ESTIMATED_WITH, "")
-    has, had = (tuple(s.split(",")) if s else ("no effect",) for s in (now, before))
-    trials = tuple(one.stored.id for one in other)
-    states = log.source["estimated"].split(",")
-    return (found("log.estimated", *states, now=has, before=had, trials=trials),)
-
-
 def same_recording(
     workspace: Folder, path: Path, data: bytes, log: ForeignLog | None
 ) -> StoredTrial | None:
