@@ -56,8 +56,6 @@ if TYPE_CHECKING:
     from grounded.solve.ddp import Solution
 
 LATEST = 100  # iterations of a plan whose progress is told if it is not optimal
-ABSURD = 10.0  # of the best cost: likely error from which its figure says nothing
-RISKY = 0.2  # of the best cost: likely loss of a step above which the own derivatives are asked
 
 
 def propose(
@@ -188,8 +186,6 @@ def _step(about: About) -> tuple[About, Proposal | None]:
     made = by_step or by.step_from(due)
     if by is not about and made and made.candidate and about.ruined_by(made.candidate):
         by, made = about, about.step_from(due)
-    if by.corrected and made and made.candidate and not by_step:
-        made = _surer(by, due, made)
     if not goes_on and (by_step := _by_step(by)) is not None:
         made = _promising(made, by_step)
     return by, made
@@ -230,26 +226,6 @@ def _below_noise(
     return let_down(ended(make.now, Ending.BELOW_NOISE, less), make.fingerprint)
 
 
-def _surer(about: About, step: Step, corrected: Proposal) -> Proposal | None:
-    """Return a step by the model's own derivatives if the corrected ones may lose much, else that.
-
-    Derivatives corrected by noisy trials promise much, within a larger likely error. If the step by
-    the own derivatives is doubted after two losses, neither is made.
-    """
-    made = corrected.candidate
-    assert made is not None
-    if not made.expected_gain < RISKY * about.incumbent.utility:
-        return corrected
-    own = About(about.make, about.incumbent, about.options, original=about.original, plainly=True)
-    found = own.step_from(step)
-    if own.doubted is not None:
-        about.doubted = own.doubted
-        return None
-    if found is None or found.candidate is None:
-        return corrected
-    return found if found.candidate.expected_gain > made.expected_gain else corrected
-
-
 def _by_step(about: About) -> Proposal | None:
     """Return a step by derivatives corrected step by step; None if none is due or worth a trial."""
     make, options = about.make, about.options
@@ -276,16 +252,6 @@ def _ended(make: Maker, incumbent: Tried, rejected: About, options: SearchOption
     finite = [gain for gain in rejected.promised if np.isfinite(gain)]
     lost, most = _steps_lost(make, own), max(finite, default=0.0)
     ask = found("search.diagnose", then=DIAGNOSE)
-    if doubted is None and (ruinous := rejected.ruinous) is not None:
-        off = ruinous.likely_off
-        why = found(
-            "search.too_doubtful",
-            own,
-            best=own,
-            gain=ruinous.predicted_gain,
-            error=off if off < -ABSURD * incumbent.utility else None,
-        )
-        return ended(make.now, Ending.DOUBTFUL, why, ask)
     if doubted is None and rejected.promised and not finite:
         return ended(make.now, Ending.DIVERGES, found("search.diverges", own, best=own), ask)
     if doubted is None and most < -rejected.least and not lost:

@@ -12,7 +12,7 @@ import numpy as np
 from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.rollout import Rollout, Run, apart, for_late_samples
+from grounded.rollout import Rollout, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Slopes, Tried, Way
 from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
@@ -41,8 +41,6 @@ GAIN_SHARE, CAUTION_PARTS = (
 MOST_CAUTION = 3  # units of caution by which gains are lowered at most to what ran quietly
 SAME_STEP = 0.2  # relative distance to a run that lost within which a step counts as the same
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
-REFUTED = 2  # bad losses of steps with corrected derivatives before those are given up
-MISTAKEN = 0.5  # share of its predictions that the plain model may miss
 ALIKE = 0.05  # of the incumbent's cost: promises of two plans that differ by less
 FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
@@ -79,7 +77,6 @@ class About:
         options: SearchOptions,
         way: Way = "",
         original: bool = False,
-        plainly: bool = False,
     ) -> None:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
         self.original = original
@@ -108,8 +105,7 @@ class About:
         elif options.damps and len(make.now.history) > 1 and not self._kept():
             from grounded.search.step.mispredictions import believed
 
-            trusted = not plainly and self._refuted() < REFUTED
-            found = believed(planner, incumbent, make.now.history, self.real, trusted)
+            found = believed(planner, incumbent, make.now.history, self.real)
             self.alternatives = found.alternatives
             self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
         already = predicted(self.real, incumbent.candidate.policy).utility
@@ -117,8 +113,7 @@ class About:
         self.least = options.tolerance * abs(self.already)
         self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
         self.promised: list[float] = []  # gains of steps that were too small
-        self.ruinous: Candidate | None = None  # a step rejected because of its predicted loss
-        self.doubted: Candidate | None = None  # the next step after two losses
+        self.doubted: Candidate | None = None  # a step that is not made for its likely error
 
     @property
     def slopes(self) -> Slopes:
@@ -136,17 +131,6 @@ class About:
         off = self.incumbent.gain_over(base) - made.predicted_gain
         lost = losers_of(history, made.id, made.model)
         return not lost and abs(off) <= (1 - KEPT_PROMISE) * made.predicted_gain
-
-    def _refuted(self) -> int:
-        """Count the steps with corrected derivatives that lost by more than their likely error."""
-        best, model = self.incumbent, self.make.fingerprint
-        lost = losers_of(self.make.now.history, best.candidate.id, model)
-        corrected = {c.id for c in lost if c.of_corrected and c.of_original == self.original}
-        return sum(
-            tried.gain_over(best) < tried.candidate.expected_gain
-            for tried in self.make.now.history
-            if tried.candidate.id in corrected
-        )
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """Return a candidate with this model's prediction and its likely error."""
@@ -177,9 +161,9 @@ class About:
 
         A step whose likely error exceeds its gain is only used if there is no other. If two steps
         have lost, not by chance, and the next one is such a step and promises little, none is
-        used. Steps for which a model that explains the trials predicts a very large loss are
-        skipped. So are steps whose run is nearly that of a candidate that lost: if the damping
-        penalty is small beside the other weights, ten times the damping gives the same step.
+        used. Steps that may lose more than the best one costs are skipped. So are steps whose run
+        is nearly that of a candidate that lost: if the damping penalty is small beside the other
+        weights, ten times the damping gives the same step.
 
         Args:
             first: the due step, regardless of the derivatives of those that lost.
@@ -216,11 +200,11 @@ class About:
                     continue
                 told = self._told(proposal.candidate)
                 proposal = replace(proposal, candidate=told)
-                if self._ruinous(told):
-                    self.ruinous = self.ruinous or told
-                elif sure_losses >= LOST and self._doubtful(told):
+                if sure_losses >= LOST and self._doubtful(told):
                     self.doubted = told
                     return unsafe
+                if told.expected_gain < self.incumbent.utility:  # it may lose the best cost again
+                    self.doubted = self.doubted or told
                 elif made.expected_gain > self.least:
                     return proposal
                 else:
@@ -230,11 +214,6 @@ class About:
             if abs(made.predicted_gain) <= self.least:
                 break
         return doubted or unsafe
-
-    def _ruinous(self, made: Candidate) -> bool:
-        """Return whether it is predicted to lose more than the incumbent's whole cost."""
-        (cost,) = self._disturbed([self.incumbent.candidate.policy])
-        return made.expected_gain < -max(cost, -self.incumbent.utility)
 
     def ruined_by(self, made: Candidate) -> bool:
         """Return whether this model gives a step of another one far more than the best cost.
@@ -271,73 +250,16 @@ class About:
         return apart(self.real, run, other) <= SAME_STEP**2 * apart(self.real, self.run, other)
 
     def _told(self, made: Candidate) -> Candidate:
-        """Return the candidate with its likely error raised to what other models imply.
-
-        These are the alternatives, and the plain model if it predicted the incumbent's trial. Steps
-        from earlier bests that lost are evidence, too (`_missed_before`).
-        """
-        gains = [made.predicted_gain - max(made.likely_off, self._missed_before(made))]
-        if self.alternatives:
-            own, cost = self._disturbed([self.incumbent.candidate.policy, made.policy])
-            gains.append(own - cost)
-        plainly = self._plain_gain(made)
-        if plainly is not None and plainly + self._plain_off < 0 and not self._plain_refuted:
-            gains.append(plainly + self._plain_off)
-        return replace(made, likely_off=made.predicted_gain - min(gains))
-
-    def _missed_before(self, made: Candidate) -> float:
-        """Return what a candidate would miss of its gain, judging by losses from earlier bests.
-
-        This model predicts a gain for the policy of each of those steps; the trial showed what came
-        of it. The larger the part of that predicted change b of the run in the candidate's change
-        a, the more of the shortfall is expected again: (a'b / b'b)^2 of it, at most all.
-        """
-        run = (made.predicted_states, made.predicted_inputs)
-        moved = apart(self.real, run, self.run)
-        missed = [0.0]
-        for other, far, short in self._lost_before:
-            part = (moved + far - apart(self.real, run, other)) / (2 * far)
-            if part > 0:
-                missed.append(short * min(part, 1.0) ** 2)
-        return max(missed)
-
-    @cached_property
-    def _lost_before(self) -> list[tuple[Run, float, float]]:
-        """Losses from earlier bests: predicted run, distance from the incumbent's, shortfall."""
-        best, found = self.incumbent, []
-        for tried in self.make.now.history:
-            made = tried.candidate
-            if not (tried.lost and np.isfinite(tried.utility)) or made.base == best.candidate.id:
-                continue
-            again = predicted(self.real, made.policy)
-            run = (again.states, again.inputs)
-            short = (again.utility - self.already) - tried.gain_over(best)
-            if short > 0 and (far := apart(self.real, run, self.run)) > 0:
-                found.append((run, far, short))
-        return found
+        """Return the candidate with its likely error raised to what the alternatives imply."""
+        if not self.alternatives:
+            return made
+        own, cost = self._disturbed([self.incumbent.candidate.policy, made.policy])
+        return replace(made, likely_off=max(made.likely_off, made.predicted_gain - (own - cost)))
 
     @property
     def _plain_off(self) -> float:
         """Error of the plain model, without a bias, at the incumbent's utility."""
         return abs(self.plainly - self.incumbent.utility)
-
-    @cached_property
-    def _plain_refuted(self) -> bool:
-        """Return whether the plain model mispredicted what came of steps that lost.
-
-        It did if it missed half of the changes that it predicted. Where trials scatter, small
-        changes say nothing.
-        """
-        told, missed = 0.0, 0.0
-        if self.incumbent.standard_error > 0:
-            return False
-        for tried in self.make.now.history:
-            own = tried.candidate.base == self.incumbent.candidate.id
-            if own and tried.lost and np.isfinite(tried.utility):
-                change = predicted(self.plain, tried.candidate.policy).utility - self.plainly
-                told += abs(change)
-                missed += abs(change - tried.gain_over(self.incumbent))
-        return missed > MISTAKEN * told
 
     def _plain_gain(self, made: Candidate) -> float | None:
         """Return the gain predicted by the plain model; None if it mispredicts the incumbent."""

@@ -64,7 +64,6 @@ class Ending(StrEnum):
     NOTHING_PROMISED = "nothing promised"  # the grounded model predicts no further gain
     NO_STEP = "no step improved"  # step 7: real trials lost down to the smallest step
     EVERY_STEP_LOSES = "every step loses"  # already in the grounded model
-    DOUBTFUL = "too doubtful"  # other models that explain the trials predict a large loss
     DIVERGES = "model diverges"  # when grounded on the best trial
     CRASHED = "crashed"  # every first policy crashed
     NOT_ALLOWED = "not allowed"  # the next candidate violates [limits] or [safety]
@@ -87,7 +86,6 @@ RESULTS = (
 )  # endings with a result: the search has converged
 PATIENCE = 4  # candidates in a row that may gain less than the tolerance each
 LOST = 2  # steps in a row without improvement after which a diagnosis is suggested
-DOUBTED_RUNS = 2  # runs of the best candidate after which a search that doubts its model ends
 WILD = 100.0  # a trial worse than predicted, and than the best, by this factor: diagnose
 MAX_CAUTION = 3  # times the first policy is made again, each time more gently, after a crash
 
@@ -136,12 +134,6 @@ class Standing(Result):
     def with_finding(self, one: Finding | None) -> Standing:
         """Return the standing with one more finding."""
         return replace(self, findings=(*self.findings, one)) if one else self
-
-    @property
-    def asks_again(self) -> bool:
-        """Whether another run of the best candidate may settle the doubt that ended the search."""
-        once = self.incumbent is not None and len(self.incumbent.trials) < DOUBTED_RUNS
-        return self.ending is Ending.DOUBTFUL and once
 
     @property
     def utilities(self) -> list[float]:

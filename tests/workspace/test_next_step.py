@@ -287,8 +287,8 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
 def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, runs, then):
     now = w.status().standing
     best = replace(now.incumbent, trials=now.incumbent.trials[:1] * runs)
-    why = found("search.too_doubtful", best="c0002", gain=1.0)
-    doubtful = ended(replace(now, incumbent=best), Ending.DOUBTFUL, why, ASK)
+    why = found("search.no_step", best="c0002", lost=2)
+    doubtful = ended(replace(now, incumbent=best), Ending.NO_STEP, why, ASK)
     monkeypatch.setattr(
         "grounded_trials.workspace.candidates.search_state.standing", lambda *_, **__: doubtful
     )

@@ -61,11 +61,6 @@ ENTRIES: dict[str, Entry] = {
         "inaccurate to start from",
         "correct it (fit, diagnose) and propose again",
     ),
-    "too_doubtful": Entry(
-        "note",
-        "the model promises a gain of {gain} from a step, but with a likely error[[ of {error}]], "
-        "more than the whole cost of {best}: no trial is spent on it",
-    ),
     "diverges": Entry(
         "note",
         "the model grounded on {best} [[!least? diverges for every step]][[loses with every step, "
@@ -85,7 +80,6 @@ ENTRIES: dict[str, Entry] = {
         MODEL,
     ),
     "diagnose": Entry("note", MODEL),
-    "again": Entry("note", "run {best} again"),
     "adopt_first": Entry(
         "note",
         "a better model may gain more: [[fit? fit its parameters, which alone the diagnosis "

@@ -25,8 +25,7 @@ is the share of that trial's difference from the incumbent's (`apart`, in units 
 the model does not predict. The model with the lower value is used. The same share of a new step is
 likely to be mispredicted, so a step that might lose because of it is put last (`making.About`).
 Steps that were made with corrected derivatives and lost are also left out in turn, at any distance:
-laws that such a trial refutes still predict trials nearby. After two such losses from the incumbent
-by more than the likely error, the crude derivatives are used (`making.REFUTED`).
+laws that such a trial refutes still predict trials nearby.
 With a single other trial nothing can be left out: the value is then at least the share of the
 mispredictions that law 1 leaves in the held-out parts of the run.
 
@@ -133,7 +132,6 @@ def believed(
     incumbent: Tried,
     history: Sequence[Tried],
     grounded: Problem,
-    trusted: bool = True,
 ) -> Believed:
     """Return the grounded model, with corrected derivatives if they predict trials better.
 
@@ -142,8 +140,6 @@ def believed(
         incumbent: the candidate whose trial the model replays.
         history: all candidates with their trials.
         grounded: the exact model with the incumbent's bias.
-        trusted: whether corrected derivatives may be chosen; if not, they only serve as an
-            alternative.
     """
     known = neighbours(planner, incumbent, history, grounded)
     if known is None:
@@ -178,7 +174,7 @@ def believed(
         Alternative(share, grounded, off),
         Alternative(1.0 - share, made.problem, unexplained),
     )
-    plain = misses[0] <= misses[1] or not (trusted and replays)
+    plain = misses[0] <= misses[1] or not replays
     model, missed = (Believed(grounded), misses[0]) if plain else (made, misses[1])
     return replace(model, missed=missed, alternatives=both)
 

@@ -28,7 +28,7 @@ def planned(monkeypatch):
     def propose(task, candidates, trials, options, *, identity, planner, tick):
         calls.append(identity)
         now = standing(task, candidates, trials, options, planner.fingerprint)
-        return Proposal(ended(now, Ending.DOUBTFUL, ASK), None, is_new=False)
+        return Proposal(ended(now, Ending.NO_STEP, ASK), None, is_new=False)
 
     monkeypatch.setattr(improve, "propose", propose)
     return calls

@@ -187,8 +187,8 @@ NEXT: tuple[Row, ...] = (
         lambda s: s.diagnosis and not (s.since.settled or s.came_true),
         lambda s: DIAGNOSE,
     ),
-    # another run of the best candidate may settle the doubt that ended the search, or tell a cause
-    (ENDED, lambda s: s.diagnosis and (s.now.asks_again or s.nothing_known), lambda s: s.run),
+    # another run of the best candidate may tell a cause
+    (ENDED, lambda s: s.diagnosis and s.nothing_known, lambda s: s.run),
     (ENDED, lambda s: s.diagnosis, lambda s: EXPORT),
     (ENDED, lambda s: True, lambda s: to_plan(s.workspace)),
 )

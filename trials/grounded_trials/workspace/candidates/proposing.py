@@ -330,7 +330,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     ]
     best = standing.incumbent
     return Status(
-        outlook(_asking(workspace, standing, then), then),
+        outlook(standing, then),
         then,
         settle(every),
         _certainty(standing),
@@ -368,15 +368,6 @@ def _certainty(now: Standing) -> tuple[Finding, ...]:
     if gain and waiting and waiting.id not in ran and now.incumbent is not None:
         small = beyond_one_trial(waiting, now.incumbent, now.missing)
     return tuple(one for one in (gain and gain.to_finding(), small) if one)
-
-
-def _asking(workspace: Folder, now: Standing, then: NextCommand) -> Standing:
-    """Return the standing, which asks for another run of the best one if `then` is that run."""
-    if not now.asks_again or now.asks or now.incumbent is None:
-        return now
-    own = now.incumbent.candidate.id
-    runs = then == to_run(workspace, own, "best")
-    return now.with_finding(found("search.again", own, best=own)) if runs else now
 
 
 def status_in(workspace: Folder) -> Status:
