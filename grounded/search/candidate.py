@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from grounded.figures.figure import Curve, Figure, Panel, legend
-from grounded.findings import Finding, found
 from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
@@ -130,26 +129,6 @@ class Candidate(Result):
         if own and self.unlike(best.utility):
             return self.predicted_gain
         return self.predicted_utility - best.utility
-
-    def doubt(self, best: Tried | None) -> Finding | None:
-        """Return why it may lose although it promises a gain; None if it is not `doubtful`."""
-        if not self.doubtful:
-            return None
-        gain = self.predicted_gain if best is None else self.promised_over(best)
-        return found(
-            "plan.doubtful",
-            self.id,
-            candidate=self.id,
-            gain=gain,
-            best=self.base if best is None else best.candidate.id,
-            error=self.likely_off,
-            share=None if best is None else self.stake(best),
-        )
-
-    def stake(self, best: Tried) -> float | None:
-        """Return its promised share of the best cost if that is too little for a doubtful run."""
-        share = self.promised_over(best) / abs(best.utility)
-        return share if 0 < share < DOUBTFUL_GAIN and not best.is_unsteady else None
 
     @property
     def of_original(self) -> bool:

@@ -18,12 +18,11 @@ from functools import cached_property
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
-from grounded.search.candidate import IMPROVED, START_SHARE, Candidate, Tried
+from grounded.search.candidate import DOUBTFUL_GAIN, IMPROVED, START_SHARE, Candidate, Tried
 from grounded.search.scatter import Repeats, Scatter
 
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability IMPROVED, 0.95
-MOST_RUNS_TOLD = 50  # runs of a candidate; that more would be needed is said, but not how many
 COST_RATIO = 3.44  # ratio of two costs that is no scatter: F(8, 8) exceeds it in 1 of 20 cases
 FEW_REPEATS = 8  # repeats below which a scatter may be off by half, so that their number is told
 
@@ -226,33 +225,29 @@ def one_trial_error(best: Tried, repeats: int = 1) -> float:
     return each * math.sqrt(1 / repeats + 1 / len(best.utilities)) if each > 0 else 0.0
 
 
-def runs_to_show(gain: float, best: Tried) -> int | None:
-    """Return how many runs of a candidate and as many of the best show a gain, see `SHOWN`.
+def in_question(made: Candidate, best: Tried, repeats: int = 1) -> Finding | None:
+    """Return that a candidate promises less than its trial, or its model, can tell; None if not.
 
-    None if a single repeat tells the scatter: the number goes with its square. MOST_RUNS_TOLD + 1
-    for more.
+    A gain below `SHOWN` standard errors may be luck, and one below the model's likely error may be
+    none.
     """
-    if best.repeats == 1:
+    own = best.candidate.id
+    luck = SHOWN * one_trial_error(best, repeats) if made.base == own else 0.0
+    error = made.likely_off if made.doubtful else 0.0
+    gain, cost = made.promised_over(best), abs(best.utility)
+    if not (made.doubtful or 0 < gain < luck):
         return None
-    return min(math.ceil(2 * (SHOWN * best.deviation / gain) ** 2), MOST_RUNS_TOLD + 1)
-
-
-def beyond_one_trial(made: Candidate, best: Tried, repeats: int = 1) -> Finding | None:
-    """Return that a trial can't show what a candidate promises; None if it can."""
-    own, least = best.candidate.id, SHOWN * one_trial_error(best, repeats)
-    gain = made.promised_over(best) if made.base == own else 0.0
-    if not 0 < gain < least:
-        return None
+    little = 0 < gain < DOUBTFUL_GAIN * cost and not best.is_unsteady
     return found(
         "plan.small",
         made.id,
         candidate=made.id,
         best=own,
         gain=gain,
-        least=least,
-        few=few(best.repeats),
-        runs=runs_to_show(gain, best),
-        stop=int(not made.doubtful and not best.is_unsteady),  # else `doubt` says it
+        luck=luck if luck >= error else None,
+        few=few(best.repeats) if luck >= error else None,
+        error=error if error > luck else None,
+        share=gain / cost if little else None,
     )
 
 

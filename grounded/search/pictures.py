@@ -24,7 +24,6 @@ OPEN = {  # labels of undecided verdicts
     "in doubt": "in doubt",
     "no trial": "without a trial",
 }
-OWN_PANEL_FROM = 4  # with more candidates than this, the better two thirds get a panel of their own
 
 
 def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
@@ -41,8 +40,7 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
     waits = [t for t in shown if not t.utilities and now.verdict(t) == "waiting"]
     whole = _utility(now, tried + waits, number, optimum)
-    near = (_near(whole),) if whole.loss and len(tried) > OWN_PANEL_FROM else ()
-    panels = (whole, *near, _steps(now, shown, number))
+    panels = (whole, _steps(now, shown, number))
     unsure = any(now.verdict(t) == "maybe better" for t in shown)
     key = [
         Key("best", f"first{', maybe better' * unsure} or better", "disc"),
@@ -112,18 +110,6 @@ def _utility(
         loss=loss,
         whole=True,
     )
-
-
-def _near(whole: Panel) -> Panel:
-    """Return the panel for the better two thirds of the candidates, on a linear axis."""
-    values = sorted(d.y for d in whole.dots if math.isfinite(d.y) and d.shape != "dash")
-    low, high = values[len(values) // 3], max(d.y for d in whole.dots if d.y == d.y)
-    high = min(high, values[-1] + 0.5 * (values[-1] - low))
-    room = 0.08 * (high - low) or 0.05 * abs(high)
-    dots = tuple(d for d in whole.dots if low <= d.y <= high)
-    title = "The better two thirds of the candidates, linear"
-    bounds = (low - room, high + room)
-    return replace(whole, title=title, dots=dots, loss=False, y_range=bounds)
 
 
 def _dots(tried: Tried, at: int, became: str) -> list[Dot]:

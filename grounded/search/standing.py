@@ -32,11 +32,9 @@ from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.certainty import judged
 from grounded.search.difference import (
     LUCK,
-    MOST_RUNS_TOLD,
     Difference,
     last_gain,
     missed_by_start,
-    runs_to_show,
 )
 from grounded.search.pictures import search_figure
 from grounded.search.starts import Starts
@@ -495,10 +493,7 @@ def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Find
         best: the best one.
         made: the one of the two that is run again.
     """
-    excused, gap = doubt.excused(best), abs(doubt.gain_over(best))
-    # many runs that would show the difference that is left without the starts
-    runs = runs_to_show(gap, best) if excused and best.deviation > 0 and gap > 0 else None
-    runs = runs if runs and runs > MOST_RUNS_TOLD else None
+    excused = doubt.excused(best)
     share = max(doubt.candidate.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
     known = not excused and best.repeats > 0
     return found(
@@ -510,8 +505,7 @@ def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Find
         loss=best.utility - doubt.utility if excused else None,
         start=excused or None,
         known=int(known),
-        runs=runs,
-        share=None if runs or share >= DOUBTFUL_GAIN or best.is_unsteady else max(share, 1e-9),
+        share=None if share >= DOUBTFUL_GAIN or best.is_unsteady else max(share, 1e-9),
     )
 
 

@@ -71,7 +71,7 @@ def test_help_needs_no_numpy():
 
 
 def test_a_code_is_explained():
-    one = grounded("explain", "plan.doubtful")
+    one = grounded("explain", "plan.small")
     assert one.code == 0 and WEIGHTS["note"].split(";")[0] in one.out and "remedy" in one.out
     listed = grounded("explain", "--json").json
     assert {"log.unit", "plan.no_limits"} <= {*listed["findings"]}

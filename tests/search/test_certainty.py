@@ -8,7 +8,7 @@ from scipy.stats import ttest_ind
 
 from grounded.search.candidate import Tried
 from grounded.search.certainty import with_chances
-from grounded.search.difference import Difference, beyond_one_trial
+from grounded.search.difference import Difference, in_question
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -33,7 +33,7 @@ def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
 
 def test_more_repeats_of_each_candidate_show_smaller_gains():
     made, best = promising(0.1, utilities=(-1.0,) * 9)
-    assert beyond_one_trial(made, best) and not beyond_one_trial(made, best, repeats=9)
+    assert in_question(made, best) and not in_question(made, best, repeats=9)
 
 
 def test_exact_repeats_show_at_any_utility_that_nothing_scatters():

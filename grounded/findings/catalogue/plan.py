@@ -61,8 +61,6 @@ ENTRIES: dict[str, Entry] = {
         "[[!promised? the last predictions missed the utility by {missed}]][[; {failed:run} "
         "failed]][[; this one promises a gain of {gain}]][[less? , less than such an error]]"
         "[[noise? , which may only be the noise of the run that it replays]]",
-        "[[it gains at most {share:%} of what {best} costs: run it if that is worth a run, else "
-        "stop with {best} (`export best`)]]",
     ),
     "untested": Entry(
         "note",
@@ -98,19 +96,13 @@ ENTRIES: dict[str, Entry] = {
         "the plan is not optimal in the model: {why}[[ (the last {last} by {share:%})]]; it can be "
         "run all the same: the steps from its run go on improving it",
     ),
-    "doubtful": Entry(
-        "note",
-        "{candidate} may well lose: it promises {gain:.3g} over {best}, but judging by earlier "
-        "trials the model's likely error there is {error:.3g}",
-        "[[if it keeps its promise, it gains {share:%} of what {best} costs: run it if that is "
-        "worth a run, else stop with {best} (`export best`)]]",
-    ),
     "small": Entry(
         "note",
-        "{candidate} promises {gain:.2g} over {best}, less than its trial can show: a gain below "
-        "{least:.2g} may be luck[[, from {few:repeat} only]][[. To show it takes {runs} runs of "
-        "each of the two]]",
-        "[[stop? if that is too many, stop with {best} (`export best`)]]",
+        "{candidate} promises {gain:.2g} over {best}, less than [[its trial can show: a gain below "
+        "{luck:.2g} may be luck]][[, from {few:repeat} only]][[the model's likely error there, "
+        "judging by earlier trials: {error:.3g}]]",
+        "[[it gains at most {share:%} of what {best} costs: run it if that is worth a run, else "
+        "stop with {best} (`export best`)]]",
     ),
     # the first plan of a task
     "no_motion": Entry(

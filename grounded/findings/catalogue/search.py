@@ -23,8 +23,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "{loser} lost to {best}[[ by {loss}]][[, but by the model {start} of that is due to where "
         "the runs began]][[known? by no more than noise may explain]]: {candidate} is waiting for "
-        "another trial[[. To show that difference takes {runs} runs of each, or more: if that is "
-        "too many, stop with {best}]][[. {loser} promises {share:%} of what {best} costs: if that "
+        "another trial[[. {loser} promises {share:%} of what {best} costs: if that "
         "is not worth a run, stop with {best} (`export best`)]]",
     ),
     "discard_first": Entry(

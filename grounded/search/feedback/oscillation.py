@@ -34,7 +34,6 @@ from grounded.trial import Trial
 # fraction of an input's range within which it counts as at its limit; share of steps that is often
 NEAR_LIMIT, OFTEN_AT_LIMIT = 0.01, 0.3
 SWINGS = 6  # swings of an input about its plan by at least the plan's range: a limit cycle
-NEARBY, PERIODIC = 2, 0.5  # frequencies beside the strongest, and their share in a limit cycle
 # share of the strength that oscillated, if none weaker than that ran quietly
 UNKNOWN_STRENGTH = 0.5
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
@@ -69,23 +68,6 @@ def swings(made: Candidate, trial: Trial, range_: Array) -> Array:
     sizes = np.maximum(range_, np.abs(median(off)))
     each = zip(off.T, sizes, range_, strict=True)
     return np.array([_swings(one, size) if of > 0 else 0 for one, size, of in each])
-
-
-def periodic(values: Array) -> bool:
-    """Return whether a signal (T,) has much of its power near one frequency.
-
-    A limit cycle has; sensor noise that high gains make an input of has not. Short signals, whose
-    few frequencies can't tell, count as periodic.
-    """
-    known = values[np.isfinite(values)]
-    line = np.arange(len(known)) - 0.5 * (len(known) - 1)
-    level = known - known.mean()
-    level = level - line * float(line @ level) / max(float(line @ line), 1e-300)
-    power = np.abs(np.fft.rfft(level * np.hanning(len(level)))) ** 2
-    if not power.sum() > 0:
-        return False
-    k = int(np.argmax(power))
-    return bool(power[max(0, k - NEARBY) : k + NEARBY + 1].sum() > PERIODIC * power.sum())
 
 
 def plan_range(made: Candidate, task: Task) -> Array:

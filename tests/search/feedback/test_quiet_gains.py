@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from grounded.plant import Noise, Plant
-from grounded.search.feedback.oscillation import periodic, quiet_gains
+from grounded.search.feedback.oscillation import quiet_gains
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
@@ -98,14 +98,6 @@ def test_feedback_is_bounded_by_what_ran_quietly(told, levels, most, by, needed)
         return
     assert (found.by, found.needed) == (by, needed)
     assert found.most == pytest.approx(most)
-
-
-@pytest.mark.parametrize("cycle", [False, True])
-def test_noise_that_gains_carry_is_told_from_a_limit_cycle(cycle):
-    rng, T = np.random.default_rng(0), 120
-    shaken = np.convolve(rng.normal(0, 0.12, T + 2), [0.3, 0.5, 0.3], "valid")
-    moves = 0.2 * np.sin(0.7 * np.arange(T)) + 0.3 * shaken if cycle else 1.6 * shaken
-    assert periodic(moves) == cycle
 
 
 def test_only_stronger_feedback_is_a_risk(told):

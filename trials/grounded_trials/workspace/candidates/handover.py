@@ -30,7 +30,7 @@ from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.policy import Policy
 from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
-from grounded.search.difference import beyond_one_trial
+from grounded.search.difference import in_question
 from grounded.search.feedback.oscillation import quiet_gains
 from grounded.search.safety import coasts_out, objections, spread
 from grounded.search.standing import Standing
@@ -287,8 +287,7 @@ class Check:
         repeats = self.workspace.config.search.repeats
         quiet = quiet_gains(self.workspace.task, self.standing.history)
         told = [
-            made.doubt(best) if untried else None,
-            beyond_one_trial(made, best, repeats) if best is not None and untried else None,
+            in_question(made, best, repeats) if best is not None and untried else None,
             quiet.risk(made) if quiet else None,
             *self._became(),
         ]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.result import Result
-from grounded.search.difference import last_gain
+from grounded.search.difference import in_question, last_gain
 from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
 from grounded.search.standing import Ending, Phase
 from grounded_trials.wording import rendered
@@ -360,13 +360,11 @@ def _settled(workspace: Folder, last: Diagnosis | None, since: Since) -> Settled
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:
     """Return how certain the last gain is, and what the run that waits can show."""
-    from grounded.search.difference import beyond_one_trial
-
     gain, waiting = last_gain(now.history), now.outstanding
     ran = {t.candidate.id for t in now.history if t.trials}
     small = None
     if gain and waiting and waiting.id not in ran and now.incumbent is not None:
-        small = beyond_one_trial(waiting, now.incumbent, now.missing)
+        small = in_question(waiting, now.incumbent, now.missing)
     return tuple(one for one in (gain and gain.to_finding(), small) if one)
 
 

@@ -242,10 +242,8 @@ def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) 
     if made.way == "gentler gains" or not gain > 0:  # no model swings, so none tells its gain
         return found("plan.tested", made.id).knowing(facts)
     noise = len(best.trials) == 1 and gain < replayed
-    doubtful = gain < max(missed[-1], made.likely_off)
-    share = made.stake(best) if (doubtful or noise) and not made.doubtful else None
-    facts |= {"gain": gain, "less": int(doubtful), "noise": int(noise), "share": share}
-    return found("plan.tested", made.id, best=best.candidate.id).knowing(facts)
+    facts |= {"gain": gain, "less": int(gain < missed[-1]), "noise": int(noise)}
+    return found("plan.tested", made.id).knowing(facts)
 
 
 def samples(made: Candidate, now: Standing, task: Task) -> Finding | None:
