@@ -20,7 +20,7 @@ from grounded.search.feedback.sample_age import planned_age, run_ages
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.scatter import beyond_noise
-from grounded.search.standing import LOST, Ending, Proposal, Standing, ended, wild
+from grounded.search.standing import Ending, Proposal, Standing, ended, wild
 from grounded.search.step.directions import base_columns, direction
 from grounded.search.step.step_size import KEPT_PROMISE, SearchOptions, Step, losers_of
 from grounded.solve import ddp
@@ -159,11 +159,10 @@ class About:
     def step_from(self, first: Step) -> Proposal | None:
         """Return the first step worth a trial, else one that is not allowed, else None.
 
-        A step whose likely error exceeds its gain is only used if there is no other. If two steps
-        have lost, not by chance, and the next one is such a step and promises little, none is
-        used. Steps that may lose more than the best one costs are skipped. So are steps whose run
-        is nearly that of a candidate that lost: if the damping penalty is small beside the other
-        weights, ten times the damping gives the same step.
+        A step whose likely error exceeds its gain is only used if there is no other, and none that
+        may lose more than the best one costs. Steps whose run is nearly that of a candidate that
+        lost are skipped: if the damping penalty is small beside the other weights, ten times the
+        damping gives the same step.
 
         Args:
             first: the due step, regardless of the derivatives of those that lost.
@@ -173,7 +172,6 @@ class About:
         first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
         lost = losers_of(history, self.incumbent.candidate.id, model)
         foretold = [predicted(self.real, candidate.policy) for candidate in lost]
-        sure_losses = 0 if self.incumbent.standard_error > 0 else len(lost)
         unsafe: Proposal | None = None
         doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
@@ -200,9 +198,6 @@ class About:
                     continue
                 told = self._told(proposal.candidate)
                 proposal = replace(proposal, candidate=told)
-                if sure_losses >= LOST and self._doubtful(told):
-                    self.doubted = told
-                    return unsafe
                 if told.expected_gain < self.incumbent.utility:  # it may lose the best cost again
                     self.doubted = self.doubted or told
                 elif made.expected_gain > self.least:
@@ -227,11 +222,6 @@ class About:
         missed = [t.promised - t.utility for t in history if t.candidate.id in ids]
         lost = self.already - predicted(self.real, made.policy).utility
         return not lost <= max([-self.incumbent.utility, *(WITNESS * miss for miss in missed)])
-
-    def _doubtful(self, made: Candidate) -> bool:
-        """Return whether it promises little, and less than its likely error."""
-        little = made.predicted_gain < DOUBTFUL_GAIN * -self.incumbent.utility
-        return little and made.expected_gain <= 0.0
 
     def _disturbed(self, policies: Sequence[Policy]) -> list[float]:
         """Return the costs of policies in the alternatives; 0 without alternatives.

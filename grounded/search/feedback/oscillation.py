@@ -1,11 +1,10 @@
 """Detect feedback that makes inputs oscillate, and keep it at the strength that ran quietly.
 
 A limit cycle shows in a trial: an input swings about its plan, by the plan's range or more
-(`swings`), or goes from limit to limit (`between_limits`). Noise that high gains carry swings an
-input, too, at all frequencies (`periodic`).
+(`swings`), or goes from limit to limit (`between_limits`).
 
-What a loop lacks to be stable (a delay, a filter) is not in the
-model, so no prediction shows it; runs do. So the strength of a policy's feedback, input by input,
+What a loop lacks to be stable (a delay, a filter) is not in the model, so no prediction shows it;
+runs do. So the strength of a policy's feedback, input by input,
 
     mean over t of sum_j |K_tij| d_j,    d_j = rms motion of state j in a step of the run that swung
 
