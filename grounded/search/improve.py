@@ -22,6 +22,7 @@ bit. `ask_tell` has the loop around it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -53,9 +54,6 @@ from grounded.trial import Trial
 
 if TYPE_CHECKING:
     from grounded.search.first_policy import Tick
-    from grounded.solve.ddp import Solution
-
-LATEST = 100  # iterations of a plan whose progress is told if it is not optimal
 
 
 def propose(
@@ -100,32 +98,29 @@ def propose(
     trials = list_of(trials, Trial, "trials")
     planner = planner or Planner(task, task)
     fingerprint = planner.fingerprint
+
+    # Steps 3, 6 and 7: where the search stands by the trials of the real system.
     now = standing(task, candidates, trials, options, fingerprint, planner)
-    if now.phase is Phase.AWAIT:
-        return Proposal(now, now.outstanding, is_new=False)
     if now.phase is not Phase.PROPOSE:
-        return Proposal(now, None, is_new=False)
+        return Proposal(now, now.outstanding, is_new=False)
+
+    # The model: with parameters fitted to the trials, and z as wide as the policies that ran.
     if options.refit and now.incumbent is not None:
         planner = planner.with_model((refit or refitted)(planner.plan, trials))
     planner = planner.feeding_back(tried.candidate.policy for tried in now.history)
     make = Maker(planner, now, identity or f"c{len(candidates) + 1:04d}", fingerprint)
-    if now.incumbent is None:
-        policy, plan = planner.first_policy(now.caution, tick)
-        if not plan.ok:
-            raise refused("plan.none", why=plan.sentence)
-        model = planner.plan.problem(exact=True)
-        made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
-        if plan.status == "converged":
-            return made
-        slow = found("plan.not_optimal", why=plan.sentence, share=_slowly(plan), last=LATEST)
-        return replace(made, findings=(*made.findings, slow))
-    return _improvement(make, now.incumbent, options)
+    if now.incumbent is not None:
+        return _improvement(make, now.incumbent, options)
 
-
-def _slowly(plan: Solution) -> float | None:
-    """Return the share by which the last iterations of a plan lowered its cost; None for few."""
-    costs = [line.cost for line in plan.trace[-LATEST:]]
-    return 1 - costs[-1] / costs[0] if len(costs) == LATEST and costs[0] > 0 else None
+    # Steps 1 and 2: the optimal policy of the crude model.
+    policy, plan = planner.first_policy(now.caution, tick)
+    if not plan.ok:
+        raise refused("plan.none", why=plan.sentence)
+    model = planner.plan.problem(exact=True)
+    made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
+    if plan.status == "converged":
+        return made
+    return replace(made, findings=(*made.findings, found("plan.not_optimal", why=plan.sentence)))
 
 
 def refitted(task: Task, trials: Sequence[Trial]) -> Model:
@@ -181,14 +176,34 @@ def _step(about: About) -> tuple[About, Proposal | None]:
     """Return the due step, and the grounded model that makes it."""
     make, base, by, due = about.make, about.incumbent.candidate, trusted(about), about.make.now.step
     assert due is not None
-    goes_on = base.way == BY_STEP and base.model == make.fingerprint
-    by_step = _by_step(by) if goes_on else None
-    made = by_step or by.step_from(due)
+
+    # Steps of derivatives that hold for each step of the run by itself go on.
+    by_step = _by_step(by)
+    if by_step is not None and base.way == BY_STEP and base.model == make.fingerprint:
+        return by, by_step
+
+    # Else they make the step if that promises more. One without the adopted effects must not ruin
+    # the run with them.
+    made = by.step_from(due)
     if by is not about and made and made.candidate and about.ruined_by(made.candidate):
         by, made = about, about.step_from(due)
-    if not goes_on and (by_step := _by_step(by)) is not None:
-        made = _promising(made, by_step)
-    return by, made
+    return by, made if _promise(made) >= _promise(by_step) else by_step
+
+
+def _promise(made: Proposal | None) -> float:
+    """Return the predicted gain of a step less its likely error; -inf for none."""
+    return made.candidate.expected_gain if made and made.candidate else -math.inf
+
+
+def _by_step(about: About) -> Proposal | None:
+    """Return a step by derivatives corrected step by step; None if none is due or worth a trial."""
+    make, options = about.make, about.options
+    step = options.due(make.now.history, about.incumbent, make.fingerprint, BY_STEP)
+    if step is None:
+        return None
+    stepping = About(make, about.incumbent, options, BY_STEP, about.original)
+    made = stepping.step_from(step) if stepping.corrected else None
+    return made if made and made.candidate else None
 
 
 def _steps_lost(make: Maker, own: str) -> int:
@@ -224,26 +239,6 @@ def _below_noise(
         few=few(best.repeats) if gain > 0 else None,
     )
     return let_down(ended(make.now, Ending.BELOW_NOISE, less), make.fingerprint)
-
-
-def _by_step(about: About) -> Proposal | None:
-    """Return a step by derivatives corrected step by step; None if none is due or worth a trial."""
-    make, options = about.make, about.options
-    step = options.due(make.now.history, about.incumbent, make.fingerprint, BY_STEP)
-    if step is None:
-        return None
-    stepping = About(make, about.incumbent, options, BY_STEP, about.original)
-    found = stepping.step_from(step) if stepping.corrected else None
-    return found if found and found.candidate else None
-
-
-def _promising(found: Proposal | None, other: Proposal) -> Proposal:
-    """Return the step that promises more, each promise less its likely error."""
-    if found is None or found.candidate is None:
-        return other
-    assert other.candidate is not None
-    better = other.candidate.expected_gain > found.candidate.expected_gain
-    return other if better else found
 
 
 def _ended(make: Maker, incumbent: Tried, rejected: About, options: SearchOptions) -> Standing:

@@ -93,8 +93,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "not_optimal": Entry(
         "note",
-        "the plan is not optimal in the model: {why}[[ (the last {last} by {share:%})]]; it can be "
-        "run all the same: the steps from its run go on improving it",
+        "the plan is not optimal in the model: {why}; it can be run all the same: the steps from "
+        "its run go on improving it",
     ),
     "small": Entry(
         "note",
