@@ -79,6 +79,11 @@ class Policy:
         """H, the number of control steps."""
         return len(self.feedforward)
 
+    @property
+    def mean_gain(self) -> float:
+        """The mean absolute feedback gain; 0 without feedback."""
+        return 0.0 if self.gain is None else float(np.abs(self.gain).mean())
+
     def after(self, steps: int) -> Policy:
         """Return the policy without its first steps."""
         return self._of_steps(slice(steps, None))

@@ -15,7 +15,7 @@ from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Slopes, Tried, Way
 from grounded.search.feedback.margin import steadied
-from grounded.search.feedback.oscillation import Quiet, between_limits, limit_cycle, quiet_gains
+from grounded.search.feedback.oscillation import between_limits, limit_cycle
 from grounded.search.feedback.sample_age import planned_age, run_ages
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
@@ -34,11 +34,8 @@ if TYPE_CHECKING:
     from grounded.search.step.mispredictions import Alternative
 
 GENTLER = 1e3  # factor on the input weights for each unit of caution
-GAIN_SHARE, CAUTION_PARTS = (
-    0.5,
-    12,
-)  # share of the mean gain to fall below; parts of a unit of caution
-MOST_CAUTION = 3  # units of caution by which gains are lowered at most to what ran quietly
+GAIN_SHARE, CAUTION_PARTS = 0.5, 12  # of the mean gain to fall below; parts of a unit of caution
+FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
 SAME_STEP = 0.2  # relative distance to a run that lost within which a step counts as the same
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 ALIKE = 0.05  # of the incumbent's cost: promises of two plans that differ by less
@@ -142,10 +139,11 @@ class About:
         """Return the same run with the incumbent's gains if the new ones cost more.
 
         The own plan of a changed model keeps its gains: the incumbent's were designed in a model
-        that lacked what was found since, such as a delay.
+        that lacked what was found since, such as a delay. So do gains that were made gentler.
         """
         new, run = made.policy, self.incumbent.candidate.policy
-        own = made.way == "own plan" or new.gain is None or run.gain is None
+        own = made.way == "own plan" or made.caution > self.incumbent.candidate.caution
+        own = own or new.gain is None or run.gain is None
         if self.alternatives and not own:
             old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
             costs = self._disturbed([new, old])
@@ -332,6 +330,7 @@ class Maker:
         if caution is None:
             follows = base is not None and base.candidate.base and way != "own plan"
             caution = base.candidate.caution if base and follows else self.now.caution
+            caution = max(caution, self.gentled)
         if caution and base is not None:
             policy = self._gently(policy, problem, predicted(problem, policy), caution)
         made = Candidate(
@@ -381,16 +380,30 @@ class Maker:
             return None
         if not limit_cycle(incumbent, self.planner.task):
             return None
-        problem, real = self.planner.plan.problem(exact=True), incumbent.utility
-        caution = own.caution + 1.0
+        problem, caution = self.planner.plan.problem(exact=True), own.caution + 1.0
         if not between_limits(incumbent, self.planner.task):
+            run, most = predicted(problem, own.policy), GAIN_SHARE * own.policy.mean_gain
             less = own.caution + np.arange(1, CAUTION_PARTS) / CAUTION_PARTS
-            most = GAIN_SHARE * _gain(own.policy)
-            run = predicted(problem, own.policy)
-            few = (c for c in less if _gain(self._gently(own.policy, problem, run, c)) < most)
-            caution = float(next(few, caution))
-        made = self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
-        return self.quietened(made, problem)
+            each = ((self._gently(own.policy, problem, run, one).mean_gain, one) for one in less)
+            caution = float(next((one for gain, one in each if gain < most), caution))
+        real = incumbent.utility
+        return self.candidate(own.policy, problem, Step(), real, "gentler gains", caution)
+
+    @cached_property
+    def gentled(self) -> float:
+        """The caution of gains that were made gentler in this model; 0 if none were.
+
+        Gains once made gentler stay so. If such a run failed, or cost many times as much as the one
+        that swung, the robot needs its gains.
+        """
+        cost = {tried.candidate.id: -tried.utility for tried in self.now.history}
+        kept = [
+            tried.candidate.caution
+            for tried in self.now.history
+            if tried.candidate.way == "gentler gains" and tried.candidate.model == self.fingerprint
+            if -tried.utility <= FELL * cost[tried.candidate.base]
+        ]
+        return max(kept, default=0.0)
 
     def _gently(self, policy: Policy, problem: Problem, run: Rollout, caution: float) -> Policy:
         """Return the same run with the gains of an LQR with GENTLER ** caution the input weight.
@@ -414,10 +427,7 @@ class Maker:
         return self.planner.narrowed(for_late_samples(made, problem))
 
     def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
-        """Return the same run with gains that hold under worse conditions, and that ran quietly."""
-        return self.quietened(self._with_margin(made, problem), problem)
-
-    def _with_margin(self, made: Candidate, problem: Problem) -> Candidate:
+        """Return the same run with gains that hold under worse conditions."""
         own = made.policy
         if own.gain is None or not self.planner.needs_margin:
             return made
@@ -430,25 +440,6 @@ class Maker:
         """The ages of the samples in the runs so far [s]."""
         return run_ages(self.planner.task, self.now.history)
 
-    @cached_property
-    def quiet(self) -> Quiet | None:
-        """How strong feedback may be, from runs of this model; None if none oscillated."""
-        return quiet_gains(self.planner.task, self.now.history, self.fingerprint)
-
-    def quietened(self, made: Candidate, problem: Problem) -> Candidate:
-        """Return the same run with feedback no stronger than ran quietly, see `quiet_gains`."""
-        quiet = self.quiet
-        if quiet is None or quiet.needed or quiet.allows(made.policy):
-            return made
-        policy, caution, run = made.policy, made.caution, predicted(problem, made.policy)
-        for more in np.arange(1, MOST_CAUTION * CAUTION_PARTS + 1) / CAUTION_PARTS:
-            policy = self._gently(made.policy, problem, run, made.caution + more)
-            caution = float(more)
-            if quiet.allows(policy):
-                break
-        made = replace(made, caution=made.caution + caution)
-        return self.foretold(made, policy, problem, made.expected_of_base)
-
     def checked(self, made: Candidate) -> Proposal:
         """Return a proposal of the candidate, or a refusal if it violates limits or [safety]."""
         task, history = self.planner.task, self.now.history
@@ -457,8 +448,3 @@ class Maker:
         ending = Ending.GAINS if against[0].code == "plan.gain" else Ending.NOT_ALLOWED
         stopped = ended(self.now, ending, against[0])
         return Proposal(stopped, None, is_new=False, findings=against, refused=made)
-
-
-def _gain(policy: Policy) -> float:
-    """Return the mean absolute feedback gain."""
-    return 0.0 if policy.gain is None else float(np.abs(policy.gain).mean())

@@ -209,9 +209,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "oscillates": Entry(
         "warn",
-        "the feedback of {swung} made inputs oscillate[[, while that of {quiet}, {share:%} as "
-        "strong, did not]][[needed? , but much weaker feedback did far worse]][[; that of "
-        "{candidate} is {strength:%} as strong as that of {swung}]]",
+        "the feedback of {swung} made inputs oscillate, and that of {candidate} is as strong",
         STOP,
     ),
     "coasts_out": Entry(

@@ -31,7 +31,7 @@ from grounded.policy import Policy
 from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
 from grounded.search.difference import in_question
-from grounded.search.feedback.oscillation import quiet_gains
+from grounded.search.feedback.oscillation import limit_cycle
 from grounded.search.safety import coasts_out, objections, spread
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -285,10 +285,9 @@ class Check:
         made, name = self.candidate, self.candidate.id
         best, untried = self.standing.incumbent, not self._trials(name)
         repeats = self.workspace.config.search.repeats
-        quiet = quiet_gains(self.workspace.task, self.standing.history)
         told = [
             in_question(made, best, repeats) if best is not None and untried else None,
-            quiet.risk(made) if quiet else None,
+            *self._oscillates(),
             *self._became(),
         ]
         if not self.same_task:
@@ -300,6 +299,14 @@ class Check:
         if self.same_task:
             told.append(self._coasting())
         yield from (one for one in told if one is not None)
+
+    def _oscillates(self) -> Iterator[Finding]:
+        """Yield that it is, or is made from, one whose feedback made inputs oscillate."""
+        made, task = self.candidate, self.workspace.task
+        for tried in self.standing.history:
+            own, strong = tried.candidate, made.caution <= tried.candidate.caution
+            if own.id in (made.id, made.base) and strong and limit_cycle(tried, task):
+                yield found("plan.oscillates", made.id, candidate=made.id, swung=own.id)
 
     def _became(self) -> Iterator[Finding]:
         """Yield that it lost, that its trials were set aside, or those that it was made from."""

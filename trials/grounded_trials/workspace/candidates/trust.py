@@ -94,7 +94,7 @@ def made_how(made: Candidate, task: Task, history: tuple[Tried, ...]) -> Finding
     share = None
     if made.way == "gentler gains":
         base = next(t.candidate for t in history if t.candidate.id == made.base)
-        share = _gain(made) / _gain(base)
+        share = made.policy.mean_gain / base.policy.mean_gain
     step = str(Step(made.damping, made.alpha)) if made.grounded else None
     return found(
         "plan.made",
@@ -110,12 +110,6 @@ def made_how(made: Candidate, task: Task, history: tuple[Tried, ...]) -> Finding
         original=int(made.of_original),
         gentle=int(bool(made.base) and made.caution > 0 and share is None),
     )
-
-
-def _gain(made: Candidate) -> float:
-    """Return the mean absolute feedback gain."""
-    gain = made.policy.gain
-    return 0.0 if gain is None else float(abs(gain).mean())
 
 
 def so_far(made: Candidate, best: Tried) -> Finding:
