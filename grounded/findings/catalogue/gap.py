@@ -5,6 +5,7 @@ from __future__ import annotations
 from grounded.findings.catalogue import Entry
 
 DIAGNOSE = "then diagnose again"
+FIX = "fix the program that writes {about}, and discard the trials that the search learned from"
 
 ENTRIES: dict[str, Entry] = {
     # the three lines of a diagnosis
@@ -107,7 +108,7 @@ ENTRIES: dict[str, Entry] = {
     "corrected": Entry(
         "warn",
         "corrected here, but not in the stored trials: {about}",
-        "fix the program that writes the trials, and discard those that the search learned from",
+        FIX,
     ),
     # the next step: one of them
     "next.record": Entry(
@@ -180,10 +181,7 @@ ENTRIES: dict[str, Entry] = {
         "the last {lost:candidate} planned with the adopted {about} lost",
         f"undo the last adoption with `grounded adopt --undo`, {DIAGNOSE}",
     ),
-    "next.fix": Entry(
-        "warn",
-        "fix the program that writes {about}, and discard the trials that the search learned from",
-    ),
+    "next.fix": Entry("warn", FIX),
     "next.probe": Entry(
         "note",
         "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {by:.3g} "

@@ -56,13 +56,11 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "{about} has {states} states and {inputs} inputs, more than the {most} for which a "
         "{what:plan=plan,fit=fit,diagnosis=diagnosis} is made",
-        "take a model of the part that matters here",
     ),
     "short": Entry(
         "refuse",
         "a {what:bias=bias,fit=fit,noise=noise estimate,estimate=state estimate,"
         "diagnosis=diagnosis} needs a trial of {needs} finite steps or more[[, got {has}]]",
-        "`verify` the stored files, or ingest a trial that ran",
     ),
     "unweighed": Entry(
         "refuse",

@@ -11,6 +11,7 @@ RAN = "[[; only then are the commands those of {ran}]]"
 TIED = "[[; as likely: a fault of {tied}]]"
 AGAIN = "[[; then discard {trials} and {source:log=ingest the log,trial=run it} again]]"
 SCALE = "[[multiply the scale in {tables} by {by:.8g} (a missing one is 1)]]"
+SPAN = "if it began elsewhere, `discard` it and set [log.span] start"
 WRITES = "[[let the program write {writes}]]"
 # how a run went can't be judged by a wrong log
 RUN: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.safety", "run.start")
@@ -158,7 +159,7 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "where {ran} begins is in doubt: its commands fit as well from {rival:.3f} s of the log on "
         "as from {used:.3f} s, which is used",
-        "if it began elsewhere, `discard` it and set [log.span] start",
+        SPAN,
     ),
     "start_loose": Entry(
         "warn",
@@ -169,7 +170,7 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "no start of {ran} was found in it: the run is assumed to begin where the commands first "
         "change, at {at:.3f} s[[, {longer:.3g} s before a run must]]",
-        "set another with [log.span] start",
+        SPAN,
     ),
     "begun_late": Entry(
         "refuse",

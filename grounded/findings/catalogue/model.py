@@ -21,7 +21,6 @@ ENTRIES: dict[str, Entry] = {
         "of {total:,} [[stretches? stretches]][[!stretches? steps]] {used:,} were used"
         "[[, in {kept} of {trials} trials]][[first?, the first of each]]"
         "[[stretches?, those with most motion]]",
-        "[[!stretches? name trials with --trials to use others]]",
     ),
     "copy": Entry("warn", "{about} equals {first}: a copy, or no noise at all; it counts once"),
     # its parameters
@@ -30,7 +29,6 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "{about} {about:is/are} known only [[if {rests} {rests:is/are} right as declared]]"
         "[[!rests? together with the others]]",
-        "measure one of them to know each",
     ),
     "not_told": Entry(
         "note",
@@ -70,7 +68,6 @@ ENTRIES: dict[str, Entry] = {
         "are "
         "known to]][[ {rows:.3g} s between rows of the log]][[ {early:.2g} s by the interpolation "
         "of states]][[!about?  at best, which is in their intervals]]",
-        "[[about? `grounded fit --latency` fits one delay of all inputs instead]]",
     ),
     # an adoption
     "adopted": Entry("note", "adopted: {about}"),

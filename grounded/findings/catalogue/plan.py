@@ -105,9 +105,7 @@ ENTRIES: dict[str, Entry] = {
         "stop with {best} (`export best`)]]",
     ),
     # the first plan of a task
-    "no_motion": Entry(
-        "note", "the target stays where the run starts, in every state", "draw another (`target`)"
-    ),
+    "no_motion": Entry("note", "the target stays where the run starts, in every state"),
     "no_limits": Entry("note", "[limits] has none for {about}: plans may send values of any size"),
     "without_effect": Entry(
         "note",

@@ -8,6 +8,11 @@ OF = "[[{log}: ]]"  # the file, where the log is refused
 # of a run that its program spoilt, neither its end nor its motion says anything of the candidate
 OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.safety")
 SPOILT = (*OUTCOME, "run.start")  # of a log that is taken as a run all the same
+# what a program should do that sends other commands than those of the candidate
+CALL = (
+    "call `runner.action` in each control step with the seconds since the run began and the states "
+    "as they are logged, send what it returns at once, and run {ran} again"
+)
 
 ENTRIES: dict[str, Entry] = {
     # the program
@@ -15,8 +20,7 @@ ENTRIES: dict[str, Entry] = {
         "aside",
         OF + "its commands are what {ran} sends if `runner.action` gets [[the time in {time}]]"
         "[[{states} in {unit}]][[{states} times {times:.4g}]][[the states as {passed}]]",
-        "pass the seconds since the run began and the states as the model has them[[: {order}]], "
-        "and run {ran} again",
+        CALL + "[[; it takes {order}]]",
         hides=SPOILT,
     ),
     "unfed": Entry(
@@ -30,14 +34,14 @@ ENTRIES: dict[str, Entry] = {
         "aside",
         OF + "its commands are what {ran} sends on states from another origin: {off} beside those "
         "in the log",
-        "pass `runner.action` the states as they are logged, in one frame, and run {ran} again",
+        CALL,
         hides=SPOILT,
     ),
     "clock": Entry(
         "aside",
         OF + "its first command is that of step {step} ({seconds:.3g} s) of {ran}, and the others "
         "follow: its clock began before the run",
-        "pass `runner.action` the seconds since the run began, and run {ran} again",
+        CALL,
         hides=SPOILT,
     ),
     "exchanged": Entry(
@@ -64,22 +68,21 @@ ENTRIES: dict[str, Entry] = {
         "aside",
         OF + "its commands are what {ran} sends on {states} smoothed by {share:.2g} of the last "
         "value in each step, {lag:size} late, but the log has them as measured",
-        "pass `runner.action` what is logged, or log what it is passed, and run {ran} again",
+        CALL,
         hides=OUTCOME,
     ),
     "unsent": Entry(
         "aside",
         "its first {steps:step} sent nothing but what was held before the run, the others the "
         "commands of {ran}",
-        "pass `runner.action` the seconds since the run began, not since the log did, and run "
-        "{ran} again",
+        CALL,
         hides=OUTCOME,
     ),
     "missed": Entry(
         "warn",
         "the first command in the log is that of step {steps} of {ran}: those before were not sent "
         "or not logged[[, and {held} held until then]]",
-        "make the program send from step 0 on, and start recording before that",
+        "make the program send from step 0 on",
     ),
     "skipped": Entry(
         "aside",
@@ -93,8 +96,7 @@ ENTRIES: dict[str, Entry] = {
         "aside",
         "its program sent the commands of {ran} {steps:step} late: the robot moved with them as "
         "they are in the log, as in {others}",
-        "pass `runner.action` the latest states and the seconds since the run began, send what it "
-        "returns at once, and run {ran} again",
+        CALL,
         hides=OUTCOME,
     ),
     # the robot

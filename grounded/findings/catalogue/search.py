@@ -58,7 +58,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "the first policy crashed {crashes} times, although each was gentler: the model is too "
         "inaccurate to start from",
-        "correct it (fit, diagnose) and propose again",
+        MODEL,
     ),
     "diverges": Entry(
         "note",
