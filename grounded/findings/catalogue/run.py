@@ -13,6 +13,7 @@ CALL = (
     "call `runner.action` in each control step with the seconds since the run began and the states "
     "as they are logged, send what it returns at once, and run {ran} again"
 )
+ANEW = "`discard {trial}` and run {ran} again; if it ran as it should, `propose` goes on"
 
 ENTRIES: dict[str, Entry] = {
     # the program
@@ -114,8 +115,7 @@ ENTRIES: dict[str, Entry] = {
         "aside",
         "it [[missed its prediction by {missed:,.3g}]][[cost {cost:,.3g}]], {times:,.2g} times "
         "what runs do otherwise[[ ({others})]]",
-        "did it run as it should? If not (a motor, a sensor, somebody in the way), `discard "
-        "{trial}` and run {ran} again; if it did, `propose` goes on",
+        ANEW,
         hides=OUTCOME[2:],
     ),
     "early": Entry(
@@ -144,7 +144,7 @@ ENTRIES: dict[str, Entry] = {
     "asked": Entry(
         "aside",
         "it did not run {ran} as it should, as `ingest` told",
-        "`discard {trial}`, unless it ran {ran}; then `propose` goes on",
+        ANEW,
     ),
     # its start
     "start_spoils": Entry(
