@@ -1,6 +1,6 @@
 """The solver's problems, and their solution by CasADi, Crocoddyl and JAX; `run.py` calls it.
 
-    python benchmarks/peers.py casadi|fatrop|crocoddyl|jax CASE.npz BEST
+    python benchmarks/peers.py casadi|crocoddyl|jax CASE.npz BEST
 
     car       n = 6 + 2 previous inputs, m = 2, H = 200: 10 s on a circle at 20 Hz, without the
               model's stall and braking, so that every solver sees smooth functions
@@ -145,8 +145,8 @@ def by_iterations(case: SimpleNamespace, solve: Callable[[int], float], repeats:
     return {"iterations": iterations, "cost": solve(iterations), "ms": ms}
 
 
-def casadi(case: SimpleNamespace, plugin: str = "ipopt") -> dict[str, object]:
-    """Multiple shooting, exact sparse derivatives in CasADi's virtual machine."""
+def casadi(case: SimpleNamespace) -> dict[str, object]:
+    """Ipopt, multiple shooting, exact sparse derivatives in CasADi's virtual machine."""
     import casadi as ca
 
     started = time.process_time()
@@ -171,14 +171,8 @@ def casadi(case: SimpleNamespace, plugin: str = "ipopt") -> dict[str, object]:
         w.append(U[t])
         guess.append(case.u[t])
     nlp = {"x": ca.vertcat(*w), "f": cost, "g": ca.vertcat(*g)}
-    options = {"print_time": False, "expand": False, f"{plugin}.print_level": 0}
-    options |= {f"{plugin}.tol": 1e-6}
-    if plugin == "ipopt":
-        options |= {"ipopt.sb": "yes"}
-    else:
-        equal = [True] * int(nlp["g"].numel())
-        options |= {"structure_detection": "auto", "equality": equal}
-    solver = ca.nlpsol("solver", plugin, nlp, options)
+    options = {"print_time": False, "expand": False, "ipopt.print_level": 0, "ipopt.sb": "yes"}
+    solver = ca.nlpsol("solver", "ipopt", nlp, options | {"ipopt.tol": 1e-6})
     built, start = time.process_time() - started, np.concatenate(guess)
 
     def solve():
@@ -186,7 +180,7 @@ def casadi(case: SimpleNamespace, plugin: str = "ipopt") -> dict[str, object]:
 
     value = float(solve()["f"])
     return {
-        "peer": f"CasADi + {plugin}", "version": ca.__version__, "build_s": built, "cost": value,
+        "peer": "CasADi + Ipopt", "version": ca.__version__, "build_s": built, "cost": value,
         "iterations": solver.stats().get("iter_count"), "reached": case.reached(value),
         "ms": 1e3 * fastest(solve, case.repeats),
     }  # fmt: skip
@@ -313,11 +307,11 @@ def jax(case: SimpleNamespace) -> dict[str, object]:
 def main() -> None:
     """Solve a case with a peer."""
     peer, path, best = sys.argv[1:]
-    if peer in ("casadi", "fatrop"):
+    if peer == "casadi":
         import casadi as module
 
         module.abs = module.fabs  # NumPy's name
-        found = casadi(load(path, best, module), "ipopt" if peer == "casadi" else peer)
+        found = casadi(load(path, best, module))
     elif peer == "jax":
         import jax.numpy as module
 

@@ -3,7 +3,6 @@
     python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
     python benchmarks/run.py --peers /tmp/peers/bin/python     solve alone, beside the peers
     python benchmarks/run.py process                           whole commands
-    python benchmarks/run.py diagnose                          seconds by trials, steps, states
 
 Every solver gets the same problem (`peers.py`), the same start, and has to reach the best known
 cost to a part in 10^4. Times are CPU times of the solve alone, least of several; building a
@@ -18,7 +17,6 @@ import os
 import platform
 import subprocess
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import llvmlite
@@ -27,9 +25,7 @@ from helpers import fastest, grounded, python
 from peers import CLOSE, case
 
 from grounded.compile import DescentOptions
-from grounded.diagnosis.diagnose import diagnose
 from grounded.solve.ddp import solve
-from grounded_trials import Workspace
 
 HERE = Path(__file__).parent
 ROOM = os.pathsep.join(str(HERE.parent / folder) for folder in ("", "cli", "trials"))
@@ -62,8 +58,7 @@ def solve_part(options):
             print(f"\n{one.name}: H = {one.problem.horizon}, nz = {one.problem.nz}")
             show(ours, ours)
             path = str(one.save(Path(folder)))
-            peers = ["crocoddyl", "casadi", "jax", *["fatrop"] * options.fatrop]
-            for peer in peers if options.peers else ():
+            for peer in ("crocoddyl", "casadi", "jax") if options.peers else ():
                 command = [options.peers, "peers.py", peer, path, repr(best)]
                 environment = os.environ | {"PYTHONPATH": ROOM}
                 done = subprocess.run(
@@ -126,60 +121,12 @@ def process_part(options):
         print(f"  propose, improvement, warm  {min(proposed('c0002') for _ in range(7)):.3f}")
 
 
-LAWS = {  # example, trials, steps of each: three points a law
-    "trials": [("car-figure8", count, 100) for count in (2, 4, 8)],
-    "steps": [("car-figure8", 4, steps) for steps in (50, 100, 200)],
-    "states": [(name, 4, 60) for name in ("pendulum", "car-turn", "flight-figure8")],
-}
-
-
-def diagnose_part(options):
-    """Time diagnoses of the examples' trials: CPU seconds, ratios to importing NumPy, the law.
-
-    The kernels of the models are compiled before; those of hypotheses belong to the diagnosis.
-    """
-    numpy = min(python("-c", "import numpy").seconds for _ in range(5))
-    print(f"\nDiagnosis, CPU seconds ({numpy:.3f} for `import numpy`)")
-    with tempfile.TemporaryDirectory() as folder:
-        workspaces = {}
-        for law, points in LAWS.items():
-            rows = []
-            for name, count, steps in points:
-                if name not in workspaces:
-                    workspaces[name] = tried(Path(folder) / name, name)
-                task, trials = workspaces[name]
-                some = [shortened(trial, steps) for trial in trials[:count]]
-                seconds = fastest(lambda task=task, some=some: diagnose(task, some), 1)
-                size = {"trials": len(some), "steps": some[0].steps, "states": task.model.n}[law]
-                rows.append((size, seconds))
-                found = f"  {name:<15} {len(some)} x {some[0].steps:<4} {task.model.n:>2} states"
-                print(f"{found} {seconds:8.1f} s, ratio {seconds / numpy:7.0f}", flush=True)
-            slope = np.polyfit(*np.log(np.array(rows, float)).T, 1)[0]
-            print(f"  seconds go with {law} to the power {slope:.2f}")
-
-
-def tried(folder, name, count=8):
-    """Return the task of an example and the trials of its first candidates."""
-    workspace = Workspace.create(folder, example=name)
-    for _ in range(count):
-        if (candidate := workspace.propose().candidate) is None:  # the search ended
-            break
-        workspace.ingest(workspace.run(candidate.id).trial_file)
-    return workspace.task, [stored.trial for stored in workspace.trials()]
-
-
-def shortened(trial, steps):
-    """Return the first steps of a trial."""
-    return replace(trial, states=trial.states[: steps + 1], inputs=trial.inputs[:steps])
-
-
-PARTS = {"solve": solve_part, "process": process_part, "diagnose": diagnose_part}
+PARTS = {"solve": solve_part, "process": process_part}
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--peers", help="a Python that has the peers")
-    parser.add_argument("--fatrop", action="store_true", help="CasADi's fatrop too (slow to build)")
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
     options = parser.parse_args()
     versions = f"NumPy {np.__version__}, llvmlite {llvmlite.__version__}"
