@@ -182,7 +182,7 @@ class MujocoStepper(Stepper):
         self._still = np.append(pose, np.zeros(compiled.nv + compiled.na))
         self.coordinates, self.controls, self.settings = coordinates, controls, tuple(settings)
         self.threads = threads
-        self._model = copy.deepcopy(compiled)  # private: parameters are written into it
+        self._model = copy.deepcopy(compiled)
         late = getattr(self._model, "actuator_delay", np.zeros(compiled.nu))
         self.latency = dict[str, float]()  # [s] of the inputs that the file delays
         if not controls.torques:
@@ -191,7 +191,6 @@ class MujocoStepper(Stepper):
         late[:] = 0.0
         self._own = float(compiled.opt.timestep)
         self._model.opt.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET.value
-        self._made = np.array([s.nominal for s in settings])  # its current parameters
         both = (*self.states, *self.inputs)
         spans = [self.limits.get(name, (-np.inf, np.inf)) for name in both]
         self._spans = np.array(spans).T  # (2, n + m), the lowest and the highest
@@ -263,27 +262,19 @@ class MujocoStepper(Stepper):
 
     def advance(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """Return the next states (N, n); NaN for unstable samples."""
-        steps, h = self._substeps(dt)
-        with self._lock, _quiet():
-            self._set(p)
-            self._model.opt.timestep = h
-            try:
-                parts = [
-                    self._step(x[at : at + CHUNK], u[at : at + CHUNK], steps, self._model)
-                    for at in range(0, len(x), CHUNK)
-                ]
-            finally:
-                self._model.opt.timestep = self._own
-        return np.concatenate(parts) if parts else np.zeros((0, len(self.states)))
+        return self._advanced(x, u, p[None], np.zeros(len(x), int), dt)
 
     def rows(self, x: Array, u: Array, p: Array, dt: float) -> Array:
-        """Return the next states (N, n) of samples with their own parameters p (N, k).
-
-        Each set of parameters gets a copy of the model, and all of them are stepped in few batches.
-        """
-        steps, h = self._substeps(dt)
+        """Return the next states (N, n) of samples with their own parameters p (N, k)."""
         each, which = np.unique(p, axis=0, return_inverse=True)
-        which, after = which.reshape(-1), np.empty_like(x)
+        return self._advanced(x, u, each, which.reshape(-1), dt)
+
+    def _advanced(self, x: Array, u: Array, each: Array, which: Array, dt: float) -> Array:
+        """Step samples, each with one of several sets of parameters.
+
+        Each set gets a copy of the model, and all of them are stepped in few batches.
+        """
+        (steps, h), after = self._substeps(dt), np.empty_like(x)
         with self._lock, _quiet():
             for first in range(0, len(each), MOST_COPIES):
                 copies = [self._copy(one) for one in each[first : first + MOST_COPIES]]
@@ -292,9 +283,10 @@ class MujocoStepper(Stepper):
                 own = np.flatnonzero((which >= first) & (which < first + MOST_COPIES))
                 for at in range(0, len(own), CHUNK):
                     some = own[at : at + CHUNK]
-                    models = [copies[which[i] - first] for i in some]
-                    one = len(copies) == 1
-                    after[some] = self._step(x[some], u[some], steps, models[0] if one else models)
+                    models = (
+                        copies[0] if len(copies) == 1 else [copies[which[i] - first] for i in some]
+                    )
+                    after[some] = self._step(x[some], u[some], steps, models)
         return after
 
     def _copy(self, p: Array) -> Any:
@@ -338,8 +330,7 @@ class MujocoStepper(Stepper):
         rate = (after[:, nv:] - x[:, nv:]) / dt
         found = np.empty((len(x), len(self.inputs)))
         with self._lock, _quiet():
-            self._set(p)
-            model, data = self._model, mj.MjData(self._model)
+            model, data = self._copy(p), mj.MjData(self._model)
             for k, qpos in enumerate(self.coordinates.to_qpos(x[:, :nv])):
                 data.qpos[:], data.qvel[:], data.qacc[:] = qpos, x[k, nv:], rate[k]
                 mj.mj_inverse(model, data)
@@ -387,13 +378,6 @@ class MujocoStepper(Stepper):
             like = f"{dt / max(1, steps):.12g}"
             raise wrong("timestep", h, must="divisor", like=like, of=f"{dt:g} s")
         return steps, h if off <= EXACT * dt else dt / steps
-
-    def _set(self, p: Array) -> None:
-        """Write parameters into the private model and update the constants derived from them."""
-        if np.array_equal(p, self._made):
-            return
-        self._write(self._model, p)
-        self._made = np.array(p)
 
     def _write(self, model: Any, p: Array) -> None:
         for setting, value in zip(self.settings, p, strict=True):
