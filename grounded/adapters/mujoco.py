@@ -33,9 +33,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.adapters.beside import located
+from grounded.adapters.files import load, located
 from grounded.adapters.mujoco_body import MujocoBody
-from grounded.adapters.mujoco_files import load
 from grounded.adapters.mujoco_names import (
     BALL,
     FREE,
@@ -269,7 +268,9 @@ class MujocoStepper(Stepper):
         each, which = np.unique(p, axis=0, return_inverse=True)
         return self._advanced(x, u, each, which.reshape(-1), dt)
 
-    def _advanced(self, x: Array, u: Array, each: Array, which: Array, dt: float) -> Array:
+    def _advanced(
+        self, x: Array, u: Array, each: Array, which: NDArray[np.intp], dt: float
+    ) -> Array:
         """Step samples, each with one of several sets of parameters.
 
         Each set gets a copy of the model, and all of them are stepped in few batches.

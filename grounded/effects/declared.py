@@ -18,7 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from grounded import places
-from grounded.effects.registry import SAMPLES, parallel
+from grounded.effects.family import parallel
+from grounded.effects.registry import SAMPLES
 from grounded.frozen import Array
 from grounded.model import Model
 

@@ -444,6 +444,13 @@ def wrapping_order(families: Sequence[Family]) -> list[int]:
     return [*sorted(rest, key=depth), *reversed(inputs)]
 
 
+def parallel(slope: Array, own: Array) -> bool:
+    """Check whether one array is a multiple of the other, neither of them zero."""
+    a, b = slope.reshape(-1), own.reshape(-1)
+    lengths = float(a @ a) * float(b @ b)
+    return bool(lengths > 0 and np.isfinite(lengths) and (a @ b) ** 2 > (1 - SAME) * lengths)
+
+
 def beyond(value: Any, most: Any) -> Any:
     """Return by how much a value exceeds the range -most to most, exactly 0 within it.
 
@@ -456,6 +463,7 @@ def beyond(value: Any, most: Any) -> Any:
 
 
 LEAST_LIMIT = 1e-12
+SAME = 1e-7  # relative difference of squared lengths of equivalent rates
 
 
 def braked(effect: Effect, s: Any, added: Values, half: Any) -> Values:

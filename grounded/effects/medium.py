@@ -43,6 +43,7 @@ from grounded.effects.family import (
     Scales,
     Site,
     Values,
+    parallel,
     two_axes,
 )
 from grounded.effects.plain_step import adopted
@@ -50,7 +51,6 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import per_second
 
-SAME = 1e-6  # relative difference of squared lengths of equivalent effects
 FELT = 1e-4  # [1/s^2] smallest change of a velocity's rate by a medium that moves by 0.2
 
 
@@ -103,9 +103,8 @@ def _carried(model: Model) -> list[str]:
 def renamed(model: Model) -> dict[str, str]:
     """Return {dropped: kept}: with linear, isotropic drag a push is equivalent to a current."""
     felt, axes = _felt(model)
-    lengths = float(np.sum(felt * felt)) * float(np.sum(axes * axes))
-    same = lengths > 0 and float(np.sum(felt * axes)) ** 2 > (1 - SAME) * lengths
-    return {f"push_world:{n}": f"current:{n}" for n in _carried(model)} if same else {}
+    names = _carried(model) if parallel(felt, axes) else []
+    return {f"push_world:{n}": f"current:{n}" for n in names}
 
 
 def _felt(model: Model) -> tuple[Array, Array]:

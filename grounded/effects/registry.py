@@ -27,7 +27,6 @@ import numpy as np
 from grounded import places
 from grounded.checks import refused, unknown
 from grounded.effects import actuator, elastic, friction, geometry, joint, medium, rate, sensor
-from grounded.effects.correction import correction
 from grounded.effects.drive import speed_weights
 from grounded.effects.family import (
     Effect,
@@ -41,6 +40,7 @@ from grounded.effects.family import (
     RateFamily,
     Scales,
     Site,
+    parallel,
 )
 from grounded.effects.sensed import moved_model
 from grounded.frozen import Array
@@ -107,7 +107,10 @@ class Library:
         Raises:
             GroundedError: if there is none.
         """
-        for family in (*self.families, correction):  # a correction is adopted, but never blamed
+        for family in (
+            *self.families,
+            rate.correction,
+        ):  # adopted, but never blamed
             if family.name == name:
                 return family
         known = [family.name for family in self.families]
@@ -180,7 +183,6 @@ def _build(family: Family, target: str, model: Model, scales: Scales) -> Effect:
 
 
 SAMPLES = 40
-SAME = 1e-7  # relative difference of squared lengths of equivalent rates
 PARAMETER_FACTOR = 1.3  # factor on the parameters for the second comparison
 
 
@@ -233,13 +235,6 @@ class _Rates:
         inputs = {f"input_bias:{n}": f_u[:, kept, j] for j, n in enumerate(model.input_names)}
         params = {f"parameter:{n}": f_p[:, kept, k] for k, n in enumerate(model.param_names)}
         self.slopes = inputs | params
-
-
-def parallel(slope: Array, own: Array) -> bool:
-    """Check whether one array is a multiple of the other, neither of them zero."""
-    a, b = slope.reshape(-1), own.reshape(-1)
-    lengths = float(a @ a) * float(b @ b)
-    return bool(lengths > 0 and np.isfinite(lengths) and (a @ b) ** 2 > (1 - SAME) * lengths)
 
 
 def _free(model: Model, name: str) -> bool:

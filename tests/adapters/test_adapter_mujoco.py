@@ -14,7 +14,7 @@ from facts import holding
 mj: Any = pytest.importorskip("mujoco", reason="the adapter's extra, .[mujoco]")
 
 from grounded.adapters import mujoco as adapter  # noqa: E402
-from grounded.adapters.mujoco_files import load  # noqa: E402
+from grounded.adapters.files import load  # noqa: E402
 from grounded.adapters.stepper import Stepper  # noqa: E402
 from grounded.errors import GroundedError  # noqa: E402
 from grounded.model import Model  # noqa: E402

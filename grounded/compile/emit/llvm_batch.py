@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
-from grounded.compile.emit.llvm_text import Writer
-from grounded.compile.emit.llvm_transpose import columns_of
+from grounded.compile.emit.llvm_text import Writer, columns_of
 from grounded.compile.kernel_words import BATCH, MARCH
 
 

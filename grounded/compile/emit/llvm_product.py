@@ -13,8 +13,7 @@ from collections.abc import Callable, Sequence, Set
 from grounded.compile.emit.llvm_batch import Words, gather_rows, start_table
 from grounded.compile.emit.llvm_rollout import received
 from grounded.compile.emit.llvm_step import Dynamics
-from grounded.compile.emit.llvm_text import Writer, number, splat, vector
-from grounded.compile.emit.llvm_transpose import transposed
+from grounded.compile.emit.llvm_text import Writer, number, splat, transposed, vector
 from grounded.compile.kernel_words import Layout
 
 Row = Callable[[int], list[str]]  # row r of a matrix, or some of its pieces: vectors

@@ -29,8 +29,7 @@ from grounded.compile.emit.llvm_product import (
 )
 from grounded.compile.emit.llvm_rollout import wrap
 from grounded.compile.emit.llvm_step import Dynamics
-from grounded.compile.emit.llvm_text import Writer, number, splat
-from grounded.compile.emit.llvm_transpose import transposed
+from grounded.compile.emit.llvm_text import Writer, number, splat, transposed
 from grounded.compile.kernel_words import SWEEP, Layout
 
 

@@ -28,7 +28,7 @@ from grounded.diagnosis.likelihood.linearise import gains_of, step_jacobian
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.choose import Errors, jackknife
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects.correction import KNOTS, bells
+from grounded.effects.rate import KNOTS, bells
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.result import per_second

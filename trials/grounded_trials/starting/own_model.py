@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from grounded.adapters import mujoco
-from grounded.adapters.beside import beside, recorded
+from grounded.adapters.files import beside, recorded
 from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.model import Model

@@ -25,8 +25,8 @@ from typing import Any, Self
 
 import numpy as np
 
+from grounded.adapters.files import load
 from grounded.adapters.mujoco import MujocoStepper
-from grounded.adapters.mujoco_files import load
 from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
 from grounded.adapters.stepper import library
 from grounded.diagnosis.parts import Estimate

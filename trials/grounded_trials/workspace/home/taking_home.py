@@ -16,8 +16,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from grounded.adapters.files import files_of, load
 from grounded.adapters.mujoco import MujocoStepper
-from grounded.adapters.mujoco_files import files_of, load
 from grounded.diagnosis.parts import Estimate
 from grounded.effects import param_name
 from grounded.errors import GroundedError

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from grounded.adapters.beside import beside
+from grounded.adapters.files import beside
 from grounded.checks import of_type, refused, unknown, wrong
 from grounded.errors import GroundedError
 from grounded.foreign import contained
