@@ -35,7 +35,6 @@ from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import figure, misread
 from grounded_trials.workspace.candidates.at_rest import (
-    Rest,
     read_at_start,
     rest_at_end,
     rest_of_trials,
@@ -45,7 +44,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import refuse_ids, unknown_trial
 from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven
-from grounded_trials.workspace.user_files.config import TaskTable, set_numbers
+from grounded_trials.workspace.user_files.config import set_numbers
 from grounded_trials.workspace.user_files.task_file import read_target, seen_in
 
 
@@ -193,12 +192,8 @@ class _Case:
     asked: Manoeuvre
     columns: Mapping[str, Array]
     free: Sequence[str]
-    may_rest: Rest | None  # what would let the free states of a line rest at its end
     begins: Mapping[str, float]  # what is new in [task] start
     seen: str  # the trial that rests there
-    ran: bool  # whether there are candidates for the target before
-    old: TaskTable
-    before: Weights
     reward: Weights
 
     @property
@@ -226,15 +221,14 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     columns = _columns(workspace, asked, start)
     if asked.shape not in SHAPES:
         rest = {}
-    line = rest_at_end(workspace, columns, start) if asked.shape == "line" else None
-    rests = line if asked.rest else None
+    line = asked.rest and asked.shape == "line"
+    rests = rest_at_end(workspace, columns, start) if line else None
     if rests is not None:
         columns = {**columns, **rests.columns}
 
     # The files.
     extra = () if rests is None else (rests.weights, [*rests.columns])
     path = replace_target(workspace.config, columns, model, *extra)
-    ran = bool(workspace.candidate_ids())
     if rest:
         set_numbers(workspace.config.file, "task", start=rest)
     workspace.forget()
@@ -244,8 +238,7 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     free = tuple(name for name in model.states if name not in columns)
     planar = asked.is_path and has_plane(model)
     along = driven(model, columns, old.dt) if planar else (math.nan, math.inf)
-    offered = line if rests is None else None
-    case = _Case(workspace, asked, columns, free, offered, rest, seen, ran, old, before, reward)
+    case = _Case(workspace, asked, columns, free, rest, seen, reward)
     return Drawn(
         path,
         columns,
@@ -306,24 +299,6 @@ def _weighed_without_column(case: _Case) -> Iterator[Finding]:
         yield found("given.unweighed", *about, to=None if path else to, weight=Weight.WARN)
 
 
-def _rest(case: _Case) -> Iterator[Finding]:
-    if case.may_rest is not None:
-        ends = {name: column[-1] + 0.0 for name, column in case.may_rest.columns.items()}
-        yield found("target.may_rest", *(f"{name} = {end:.3g}" for name, end in ends.items()))
-
-
-def _replaced(case: _Case) -> Iterator[Finding]:
-    old, steps = case.old, len(next(iter(case.columns.values()))) - 1
-    if case.ran:
-        was = [f"horizon = {old.horizon}"] * (old.horizon != steps)
-        was += [
-            f"[reward] {kind}: {_equal(weights)}"
-            for kind, weights in case.before.items()
-            if weights != case.reward.get(kind)
-        ]
-        yield found("target.replaced", *was, file=str(old.target))
-
-
 def _begins(case: _Case) -> Iterator[Finding]:
     if case.begins:
         yield found("target.start", case.seen, start=_equal(case.begins))
@@ -376,6 +351,4 @@ TOLD = (
     _beyond_safety,
     _in_readings,
     _begins,
-    _rest,
-    _replaced,
 )
