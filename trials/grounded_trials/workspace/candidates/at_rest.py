@@ -343,12 +343,10 @@ class Rest:
         columns: of these states and their rates, (H + 1,) each; they count at the end only.
         weights: for [reward] terminal, also of the states that the line has: a ball that arrives
             too fast leaves a level beam as well.
-        noise: standard deviation of the states whose weight is bounded by it.
     """
 
     columns: dict[str, Array]
     weights: dict[str, float]
-    noise: dict[str, float]
 
 
 def rest_at_end(
@@ -379,9 +377,9 @@ def rest_at_end(
         if (rate := rates.get(name)) is not None and rate not in columns:
             found[rate], ranges[rate] = np.zeros(rows), ranges[name]  # only for its usual weight
     usual = usual_weights(model, {**columns, **ranges})
-    weights, noisy = {name: OFFERED * weight for name, weight in usual.items()}, {}
+    weights = {name: OFFERED * weight for name, weight in usual.items()}
     each = sensor_noise(workspace.task_trials(), model.n)
     for name, noise in zip(model.state_names, each.tolist(), strict=True):
         if name in found and weights[name] * noise**2 > NOISY:
-            weights[name], noisy[name] = NOISY / noise**2, noise
-    return Rest(found, {name: float(f"{w:.6g}") for name, w in weights.items()}, noisy)
+            weights[name] = NOISY / noise**2
+    return Rest(found, {name: float(f"{w:.6g}") for name, w in weights.items()})
