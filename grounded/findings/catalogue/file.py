@@ -158,6 +158,12 @@ ENTRIES: dict[str, Entry] = {
         "see [log.span]",
     ),
     # what is odd in a log
+    "staircase": Entry(
+        "warn",
+        "{about} {about:changes/change} at {changes:g} Hz, but rows come at {rows:g} Hz: samples "
+        "are held and {late:g} s late on average",
+        "leave cells empty in rows that repeat a value",
+    ),
     "outlier": Entry(
         "warn",
         "'{about}' is {value:.4g} at {at:.3f} s, far outside all its other samples, {low:.4g} to "

@@ -37,6 +37,7 @@ from grounded_trials.logs.signal_report import (
     findings_of,
     outliers,
     report_of,
+    staircases,
     vanished,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
@@ -198,10 +199,11 @@ def to_grid(
             report_of(samples[name], series[name], column, at, start)
             for (name, at), column in zip(times.items(), columns, strict=True)
         )
+        stairs = staircases(tracked, start, int(grid[-1]), dt)
         odd = outliers(tracked, start, int(grid[-1]))
         cut = stop == until and (steps is None or count < steps) and span.end is None
         gone = vanished([samples[n] for n in states], int(grid[-1] + dt * 1e9)) if cut else []
-        return reports, (*findings_of(reports, late), *odd, *gone)
+        return reports, (*findings_of(reports, late), *stairs, *odd, *gone)
 
     held, assumed = _sent_before(sent, start, dt, rest if still else None)
     if assumed and rest is not None and in_motion(sent, start, rest):
