@@ -13,7 +13,7 @@ from grounded_trials.formats.messages import Dynamic
 from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspection.assignment import assigned
-from grounded_trials.logs.inspection.guessed_table import mapping_toml
+from grounded_trials.logs.inspection.guess import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import inspect_log, opposite_signals
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec

@@ -3,7 +3,7 @@
 Read `log_table.py` first (the [log] table and its use), then `log_files.py` (the files of a log),
 `signals.py`, `samples.py`, `signal_report.py` and `resample.py`, which finds by `command_steps.py`
 when commands changed. `stated_units.py` knows the units of a log's numbers. `recover.py` saves the
-contents of a damaged log, which `salvage.py` finds.
+contents of a damaged log.
 
 inspection/  unknown logs: what is in them, and which [log] table fits the model
 """

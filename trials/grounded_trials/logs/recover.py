@@ -2,36 +2,59 @@
 
 The file is read record by record. A chunk with a wrong checksum is dropped entirely, since its
 wrong numbers can't be located; the message indexes after it show what it contained. Of a chunk cut
-off by the end of the file, the messages before the cut are kept. Where the chain of records is
-broken, the next place is sought from which it is intact. Schemas and channels are taken from
-anywhere in the file, including the summary.
+off by the end of the file, the messages before the cut are kept. Schemas and channels are taken
+from anywhere in the file, including the summary.
+
+Nothing marks the start of a record, but each states where the next one starts. After damage, the
+next place with an intact chain is sought: a chunk whose inner lengths are consistent, the first of
+several records in a row, or the last ones of the file.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from struct import Struct
 from typing import IO, Any
+
+import numpy as np
 
 from grounded.checks import wrong
 from grounded.errors import GroundedError
 from grounded.findings import Finding, found
 from grounded.result import UNSAID, Document
+from grounded_trials.formats.bad import BadRecord
 from grounded_trials.formats.mcap_records import (
+    ATTACHMENT,
+    CHUNK,
+    DATA_END,
+    FOOTER,
+    MAGIC,
+    MESSAGE,
+    MESSAGE_HEADER,
+    MESSAGE_INDEX,
+    METADATA,
+    PARSERS,
     Attachment,
     Channel,
+    Fields,
     Header,
     Messages,
     Metadata,
     Record,
     Schema,
+    batch,
+    chunk_content,
+    decompress,
 )
-from grounded_trials.formats.mcap_walk import mapped
+from grounded_trials.formats.mcap_walk import Data, again, chunk_records, mapped, message_positions
 from grounded_trials.formats.mcap_writer import McapWriter
+from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.log_files import empty, open_log
-from grounded_trials.logs.salvage import Salvage
 from grounded_trials.store.candidate_file import read_candidate
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.store import sync_folder
@@ -254,6 +277,251 @@ class _Copy:
     def finish(self) -> None:
         """Write the messages kept back, and end the file."""
         waiting, self.waiting = self.waiting, []
-        for batch in waiting:
-            self.messages(batch, final=True)
+        for one in waiting:
+            self.messages(one, final=True)
         self.start().finish()
+
+
+_HEAD = Struct("<BQ")
+_SPAN = Struct("<QQ")  # a chunk's first and last time
+_NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
+_NAMES |= {9: "an attached file", 12: "a table of metadata"}
+BATCH = 2**22  # [bytes] of messages outside chunks passed on together
+CHAIN = 3  # consecutive plausible records after which a place is accepted
+
+
+class Salvage:
+    """One pass over a damaged file.
+
+    Attributes:
+        losses: sentences on what was lost.
+        lost_messages: messages in dropped chunks by channel, according to the indexes.
+        dropped: first and last time stated in each dropped chunk [ns].
+        unverified: number of saved messages without a valid checksum.
+    """
+
+    def __init__(self, data: Data, name: str) -> None:
+        self.data, self.name, self.size = data, name, len(data)
+        self.losses: list[Finding] = []
+        self.lost_messages: Counter[int] = Counter()
+        self.dropped: list[tuple[int, int]] = []
+        self.unverified = 0
+        self._crc = 0
+        self._outside = 0  # messages outside checked chunks, covered only by the data checksum
+        self._tables = 0  # metadata and attachments covered only by the data checksum
+        self._ended = False  # the data section has ended; only the index follows
+        self._pending, self._waiting = list[bytes](), 0  # messages outside chunks; their bytes
+        self._defined: dict[tuple[type, int], Schema | Channel] = {}
+        self._doubtful: set[int] = set()  # channels with two different definitions
+
+    def records(self) -> Iterator[Record]:
+        """Yield what can be saved, in file order."""
+        pos = self._first()
+        dropped_chunk, before = False, 0  # the record before, 0 after a gap
+        while pos is not None and pos < self.size - len(MAGIC):
+            end = self._end_of(pos)
+            if end is None:
+                yield from self._flush()
+                after = None if self._is_cut_chunk(pos) else self._next_chain(pos + 1)
+                if after is None:
+                    yield from self._cut(pos)
+                    return
+                self.losses.append(found("file.lost", bytes=after - pos, byte=pos))
+                pos, before = after, 0
+                continue
+            opcode, content = self._read(pos, end)
+            chunked = before in (CHUNK, MESSAGE_INDEX)  # such a file has none outside
+            if opcode == MESSAGE and (chunked or self._ended):
+                self.losses.append(found("file.lost", part=_NAMES[MESSAGE], byte=pos))
+            elif opcode == MESSAGE:
+                yield from self._message(content)
+            else:
+                yield from self._flush()
+                if opcode == FOOTER:
+                    self._tail(end)
+                    return
+                if opcode == MESSAGE_INDEX and dropped_chunk:
+                    self._count_lost(content)
+                kept = len(self.losses)
+                yield from self._record(opcode, content, pos)
+                dropped_chunk = opcode == MESSAGE_INDEX and dropped_chunk
+                dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
+                before = opcode
+            pos = end
+        yield from self._flush()
+        self.losses.append(self._ends_early())
+
+    def _ends_early(self) -> Finding:
+        return found("file.cut", byte=self.size, index=int(self._ended))
+
+    def _first(self) -> int | None:
+        if self.data[:8] == MAGIC:
+            self._crc = zlib.crc32(MAGIC)
+            return len(MAGIC)
+        self.losses.append(found("file.lost", part="its beginning"))
+        return self._next_chain(0)
+
+    def _read(self, pos: int, end: int) -> tuple[int, bytes]:
+        record = self.data[pos:end]
+        if record[0] == DATA_END:
+            self._data_end(record)
+        self._crc = zlib.crc32(record, self._crc)
+        return record[0], record[9:]
+
+    def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
+        try:
+            if opcode == CHUNK:
+                yield from self._chunk(content)
+            elif opcode in PARSERS:
+                record = PARSERS[opcode](Fields(content))
+                self._tables += opcode in (METADATA, ATTACHMENT)
+                yield from self._sound(record)
+        except BadRecord as error:
+            what = _NAMES.get(opcode, f"a record of type {opcode}")
+            self.losses.append(found("file.lost", part=what, byte=pos, why=error.finding.what))
+            if opcode == CHUNK and len(content) >= 16:
+                self.dropped.append(_SPAN.unpack_from(content))
+
+    def _chunk(self, content: bytes) -> Iterator[Record]:
+        data, checked = chunk_content(content)
+        for record in list(chunk_records(data)):
+            if isinstance(record, Messages) and not checked:
+                self._outside += len(record)
+            yield from self._sound(record)
+
+    def _sound(self, record: Record) -> Iterator[Record]:
+        """Yield the record without messages of an ambiguous channel or an invalid time."""
+        if isinstance(record, Schema | Channel):
+            known = self._defined.setdefault((type(record), record.id), record)
+            if known != record:
+                self.losses.append(again(known, record).finding)
+                self._doubtful |= {
+                    c.id
+                    for c in self._defined.values()
+                    if isinstance(c, Channel) and record.id in (c.id, c.schema_id)
+                }
+                return
+        elif isinstance(record, Messages):
+            good = (record.log_times >= 0) & ~np.isin(record.channels, list(self._doubtful))
+            if not good.all():
+                self.losses.append(found("file.lost", messages=int((~good).sum())))
+                record = record.take(good)
+        yield record
+
+    def _message(self, content: bytes) -> Iterator[Record]:
+        self._pending.append(_HEAD.pack(MESSAGE, len(content)) + content)
+        self._waiting += len(content) + 9
+        self._outside += 1
+        if self._waiting > BATCH:
+            yield from self._flush()
+
+    def _flush(self) -> Iterator[Record]:
+        if self._pending:
+            data = b"".join(self._pending)
+            self._pending, self._waiting = [], 0
+            yield from self._sound(batch(data, message_positions(data, 0, len(data))[0]))
+
+    def _data_end(self, record: bytes) -> None:
+        stated = int.from_bytes(record[9:13], "little")
+        wrong = bool(stated) and stated != self._crc
+        if wrong and not self.losses and (self._outside or self._tables):
+            self.losses.append(found("file.lost", wrong=True, messages=self._outside))
+        if self.losses or not stated:
+            self.unverified += self._outside
+        self._outside, self._ended = 0, True
+
+    def _count_lost(self, content: bytes) -> None:
+        try:
+            fields = Fields(content)
+            channel = fields.uint(16)
+            self.lost_messages[channel] += fields.uint(32) // 16
+        except BadRecord:
+            return
+
+    def _is_cut_chunk(self, pos: int) -> bool:
+        """Check whether an intact chunk begins here that is cut off by the end of the file."""
+        start = self.data[pos : pos + 9 + 64]
+        if len(start) < 49 or start[0] != CHUNK:
+            return False
+        return is_chunk(start[9:], int.from_bytes(start[1:9], "little"))
+
+    def _end_of(self, pos: int) -> int | None:
+        """Return where the record there ends; None if there can't be one."""
+        if self.size - pos < 9:
+            return None
+        opcode, length = _HEAD.unpack_from(self.data, pos)
+        end = pos + 9 + int(length)
+        short = opcode == MESSAGE and length < MESSAGE_HEADER
+        if opcode == 0 or opcode > DATA_END or end > self.size or short:
+            return None
+        if opcode == CHUNK and not is_chunk(self.data[pos + 9 : pos + 73], int(length)):
+            return None
+        return end
+
+    @cached_property
+    def _places(self) -> Ints:
+        """Where a record may begin: an opcode there, and a length below 2^32."""
+        octets = np.frombuffer(self.data, dtype=np.uint8)
+        count = max(len(octets) - 8, 0)
+        maybe = (octets[:count] > 0) & (octets[:count] <= DATA_END)
+        for i in range(5, 9):
+            maybe &= octets[i : count + i] == 0
+        return np.flatnonzero(maybe)
+
+    def _next_chain(self, start: int) -> int | None:
+        """Return the first offset from `start` on with a chain of records, None for none."""
+        after = self._places[np.searchsorted(self._places, start) :]
+        return next((int(at) for at in after if self._is_chain(int(at))), None)
+
+    def _is_chain(self, pos: int) -> bool:
+        if self.data[pos] == CHUNK:
+            return self._end_of(pos) is not None
+        for _ in range(CHAIN):
+            end = self._end_of(pos)
+            if end is None:
+                return False
+            if end == self.size - len(MAGIC) and self.data[end:] == MAGIC:
+                return True
+            pos = end
+        return True
+
+    def _cut(self, pos: int) -> Iterator[Record]:
+        """Yield the intact parts of the record at `pos`, in which the file ends."""
+        rest = self.data[pos:]
+        saved = 0
+        if len(rest) > 49 and rest[0] == CHUNK:
+            for record in self._cut_chunk(rest[9:]):
+                saved += len(record) if isinstance(record, Messages) else 0
+                yield record
+        self.unverified += saved + self._outside
+        self.losses.append(self._ends_early())
+
+    def _cut_chunk(self, content: bytes) -> Iterator[Record]:
+        try:
+            fields = Fields(content)
+            fields.skip(16)
+            size = fields.uint(64)
+            fields.skip(4)
+            compression = fields.text()
+        except BadRecord:
+            return
+        data = decompress(compression, content[fields.pos + 8 :], size)[0]
+        try:
+            for record in list(chunk_records(data, cut=True)):
+                yield from self._sound(record)
+        except BadRecord:
+            return
+
+    def _tail(self, end: int) -> None:
+        if self.data[end : end + 9] != MAGIC:
+            self.losses.append(found("file.lost", part="its end"))
+
+
+def is_chunk(start: bytes, length: int) -> bool:
+    """Check whether a chunk of this length may start so: its inner lengths are consistent."""
+    if len(start) < 40:
+        return False
+    name = int.from_bytes(start[28:32], "little")
+    if name > 8 or start[32 : 32 + name] not in (b"", b"zstd", b"lz4"):
+        return False
+    return int.from_bytes(start[32 + name : 40 + name], "little") == length - 40 - name

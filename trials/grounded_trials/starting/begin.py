@@ -26,8 +26,7 @@ from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.assignment import assigned
-from grounded_trials.logs.inspection.guess import Guess
-from grounded_trials.logs.inspection.guessed_table import mapping_toml
+from grounded_trials.logs.inspection.guess import Guess, mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.joint_names import joint_names
 from grounded_trials.logs.inspection.names import PARTS

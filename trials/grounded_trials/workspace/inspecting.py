@@ -11,7 +11,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.result import Result
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.assignment import assigned
-from grounded_trials.logs.inspection.guessed_table import mapping_toml
+from grounded_trials.logs.inspection.guess import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.log_table import layout_of
 from grounded_trials.plain_file import path_of

@@ -47,9 +47,9 @@ from grounded_trials.logs.inspection.relations import (
     SURELY,
     Follows,
     Signals,
+    by_inputs,
     follows,
 )
-from grounded_trials.logs.inspection.steps import by_inputs
 from grounded_trials.logs.stated_units import (
     LENGTHS,
     Stated,
