@@ -43,9 +43,9 @@ from grounded_trials.starting.kinds import (
     kind_in,
     moving,
     skeleton,
+    with_gain,
 )
 from grounded_trials.starting.own_model import OwnModel, own_model
-from grounded_trials.starting.pushed import with_gain
 from grounded_trials.starting.skeletons import Skeleton
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table
