@@ -38,8 +38,9 @@ ENTRIES: dict[str, Entry] = {
         "refuse",
         "{about} is no log[[ but a {head}]][[: it begins with {begins}]]"
         "[[, it is a workspace{own:1=}]][[: its own is {path}]]",
-        "give the file that the robot's program wrote: MCAP, ROS 2 .db3, ROS 1 .bag, .csv, .npz, "
-        ".parquet, .mat, PX4 .ulg or ArduPilot .bin, or a folder of such runs",
+        "[[!tables? give the file that the robot's program wrote: MCAP, ROS 2 .db3, ROS 1 .bag, "
+        ".csv, .npz, .parquet, .mat, PX4 .ulg or ArduPilot .bin]][[give {tables} as one .npz if "
+        "they are one run: see docs/log-reference.md, two tables with two clocks]]",
     ),
     # tables
     "no_times": Entry(

@@ -10,9 +10,9 @@ ENTRIES: dict[str, Entry] = {
         "the sensor of {about} reads {bias}, and the target is in its readings[[; it ends at "
         "{end}]][[; [task] start is {start}]]",
     ),
-    "may_rest": Entry("note", "nothing asks {about} to rest at the end", "`--rest` does"),
-    "replaced": Entry(
+    "start": Entry(
         "note",
-        "the search starts again; before: {about}[[about? , ]]the target in {file}.bak",
+        "[task] start is where {about} rests: {start}",
+        "if runs begin elsewhere, change it and draw the target again",
     ),
 }

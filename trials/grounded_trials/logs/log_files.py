@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
+from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
 
 from grounded.errors import GroundedError, alike, needs
 from grounded.findings import found
@@ -72,7 +72,8 @@ FORMATS = (
 def logs_in(path: Path) -> list[Path]:
     """Return the logs that a path names: the runs in a folder, or the path itself.
 
-    The runs are the episodes of a LeRobot data set, or the files of a folder that is no bag.
+    The runs are the episodes of a LeRobot data set, or the files of a folder that is no bag, if
+    its tables have equally many columns.
 
     Raises:
         GroundedError: if the data set can't be used.
@@ -81,7 +82,16 @@ def logs_in(path: Path) -> list[Path]:
         return parquet.episodes(path)
     if not path.is_dir() or (path / "grounded.toml").is_file() or _bag(path):
         return [path]
-    return _sorted(p for p in _listed(path) if p.name.endswith(KINDS) and not _is_none(p)) or [path]
+    runs = _sorted(p for p in _listed(path) if p.name.endswith(KINDS) and not _is_none(p))
+    return runs if runs and len({*map(_width, runs)}) == 1 else [path]
+
+
+def _width(path: Path) -> int:
+    """Return how many words the first line of a text table has, 0 for another file."""
+    if path.suffix not in SUFFIXES:
+        return 0
+    with open_log(path) as stream:
+        return len(re.split(rb"[\t;, ]+", stream.readline(LISTING_LIMIT).strip()))
 
 
 def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
@@ -103,7 +113,10 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
             inside = inside or logs_in(path)[:1]
             if inside == [path]:
                 workspace = int((path / "grounded.toml").is_file())
-                raise GroundedError(found("file.no_log", str(path), own=workspace))
+                tables = () if workspace else sorted(p.name for p in _listed(path))
+                several = tuple(n for n in tables if n.endswith(".csv"))[:NEWEST]
+                facts: dict[str, Any] = {"tables": several} if len(several) > 1 else {}
+                raise GroundedError(found("file.no_log", str(path), own=workspace, **facts))
             files.extend(inside)
         else:
             files.append(path)
