@@ -19,8 +19,7 @@ from grounded_cli.console.terminal import LABEL, field, names_in, progress, sent
 from grounded_cli.console.workspace_option import next_line
 from grounded_trials import Workspace
 from grounded_trials.formats.tables import Layout
-from grounded_trials.logs.inspection.guess import Guess
-from grounded_trials.logs.inspection.guess import estimating
+from grounded_trials.logs.inspection.guess import Guess, estimating
 from grounded_trials.starting.begin import Begun, begin
 from grounded_trials.starting.blank import left_open
 from grounded_trials.starting.examples import EXAMPLES
