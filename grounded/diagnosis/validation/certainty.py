@@ -31,7 +31,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.explored import FittedHypotheses
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.levels import NATS, PICKED, SHARE, SURE
+from grounded.diagnosis.levels import NATS, PICKED, SHARE
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
@@ -119,20 +119,11 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     H = H + np.diag(fit.prior[k:])
     b = h.shift[which] / param_scale(data.model)[which]
     free, now = fewest(H, b, range(len(b)))
-    held = still(H, b, free)  # at nominal; the others do their work
-    while held:
-        fewer, then = fewest(H, b, [i for i in range(len(b)) if i not in held])
-        if then <= NATS:
-            free, now = fewer, then
-            break
-        held = held[1:]
     nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
     if ruler.held_out:
         least = SHARE * ruler.since_outset(fit)
         rest = fit
-        for i in held:
-            rest = unmoved(data, rest, k + i)
-        gains = {i: ruler.gain(unmoved(data, rest, k + i), fit).mean for i in free}
+        gains = {i: ruler.gain(unmoved(data, fit, k + i), fit).mean for i in free}
         for i in sorted(free, key=lambda i: gains[i])[:-1]:
             less = unmoved(data, rest, k + i)  # beside those left out already, which may hide it
             if gains[i] < least and ruler.gain(less, fit).mean < least:
@@ -152,13 +143,6 @@ def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float
         i = min(losses, key=lambda j: losses[j])
         free, now = [*free, i], losses[i]
     return free, now
-
-
-def still(H: Array, b: Array, free: Sequence[int]) -> list[int]:
-    """Return the selected shifts that may be none, the smallest last, if another one clearly is."""
-    sizes = np.abs(b) / np.sqrt(np.diag(np.linalg.pinv(H, hermitian=True)) + 1e-300)
-    none = [i for i in sorted(free, key=lambda i: -sizes[i]) if sizes[i] < SURE]
-    return none if sizes.max(initial=0.0) > SURE else []
 
 
 def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
