@@ -14,12 +14,11 @@ from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.levels import LEAST, NATS
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
 from grounded.diagnosis.validation.choose import Gain
-from grounded.diagnosis.validation.identifiable import UNKNOWN, identified
+from grounded.diagnosis.validation.identifiable import UNKNOWN, identified, values_of
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.findings import Finding
 from grounded.findings import found as finding
@@ -149,16 +148,13 @@ class Found:
     def unknowns(self) -> dict[str, tuple[float, float, float]]:
         """Each fitted delay [s] and parameter: value, standard deviation, half of its interval."""
         data, h = self.search.data, self.best.hypothesis
-        std, half = self.search.sure(self.best)
-        starts = [float(data.latency[inputs[0]]) for inputs in self.delayed.values()]
-        names, values, sizes = [*self.delayed], starts + h.theta, np.ones(len(starts))
-        if h.spread and h.shift is not None:
-            which = calibrated(data)
-            names += [data.model.param_names[i] for i in which]
-            values = np.concatenate([values, (data.model.values + h.shift)[which]])
-            sizes = np.concatenate([sizes, param_scale(data.model)[which]])
-        rows = np.column_stack([values, sizes * std, sizes * half]).tolist()
-        return {name: (v, s, w) for name, (v, s, w) in zip(names, rows, strict=True)}
+        late = [(name, float(data.latency[inputs[0]])) for name, inputs in self.delayed.items()]
+        found, sure = {}, self.search.sure(self.best)
+        for k, (one, std, half) in enumerate(zip(values_of(h, data), *sure, strict=True)):
+            name, start = late[k] if one.effect else (one.quantity, 0.0)
+            std, half = float(std) * one.scale, float(half) * one.scale
+            found[name] = start + one.value, std, half
+        return found
 
     @cached_property
     def told(self) -> dict[str, Identifiable]:

@@ -21,7 +21,6 @@ selection, the largest first, each given those before.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -29,44 +28,21 @@ import numpy as np
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.levels import CHANCE, MANY, PICKED, SHOWS
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.parts import Agreement, Changed, Estimate, TrialValue
 from grounded.diagnosis.validation.choose import jackknife
+from grounded.diagnosis.validation.identifiable import Value, values_of
 from grounded.frozen import Array
 
 RIVALS = 8  # hypotheses of one, and of two effects, that are also tested for changes
 
 
-@dataclass(frozen=True)
-class _Value:
-    """A free value, which is a column of the fit."""
-
-    effect: str
-    quantity: str
-    unit: str
-    value: float
-    scale: float  # units of the value per unit of the column
-    column: int
-
-
-def _values(fit: Fitted, data: Data, blamed: Sequence[str]) -> list[_Value]:
-    """Return the free values of the claimed effects, and the blamed parameters of a calibration."""
-    found, at, h = [], 0, fit.hypothesis
-    for effect, values in h.pairs:
-        for q in effect.free:
-            found.append(_Value(effect.name, q.name, q.unit, float(values[q.name]), 1.0, at))
-            at += 1
-    if h.shift is None or fit.gram.shape[-1] == at:
-        return found
-    sizes = param_scale(data.model)
-    for k, i in enumerate(calibrated(data)):
-        name = data.model.param_names[i]
-        if f"parameter:{name}" in blamed:
-            value = float(data.model.values[i] + h.shift[i])
-            unit = data.model.params[name].unit
-            found.append(_Value(f"parameter:{name}", name, unit, value, float(sizes[i]), at + k))
-    return found
+def _values(fit: Fitted, data: Data, blamed: Sequence[str]) -> dict[int, Value]:
+    """Return the free values of effects, and the blamed parameters of a calibration, by column."""
+    found = enumerate(values_of(fit.hypothesis, data)[: fit.gram.shape[-1]])
+    named = {k: one._replace(effect=one.effect or f"parameter:{one.quantity}") for k, one in found}
+    effects = fit.hypothesis.names
+    return {k: one for k, one in named.items() if one.effect in (*effects, *blamed)}
 
 
 def by_trial(
@@ -87,8 +63,7 @@ def by_trial(
     tests: list[Agreement] = []
     each = [data.trial_of == trial for trial in range(data.count)]
     s, G = (np.array([own[k].sum(axis=0) for k in each]) for own in (fit.score, fit.gram))
-    for one in _values(fit, data, blamed):
-        k = one.column
+    for k, one in _values(fit, data, blamed).items():
         some = np.flatnonzero(G[:, k, k] > 1e-9 * G[:, k, k].max())
         if len(some) < 2:
             continue
@@ -137,7 +112,7 @@ def _compared(fit: Fitted, data: Data, first: Sequence[bool]) -> tuple[Changed, 
     group = np.where(np.asarray(first)[data.trial_of], 0, 1)
     units = _units(data.trial_of, group)
     every = [f"parameter:{name}" for name in data.model.param_names]
-    values, taken = {v.column: v for v in _values(fit, data, every)}, list[int]()
+    values, taken = _values(fit, data, every), list[int]()
     while left := {
         c: one
         for c in values.keys() - {*taken}

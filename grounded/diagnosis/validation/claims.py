@@ -19,8 +19,7 @@ from grounded.diagnosis.hypotheses.lookalike import (
 )
 from grounded.diagnosis.hypotheses.search import LARGE_GAIN
 from grounded.diagnosis.levels import NATS, SURE
-from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import param_scale
+from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Likeness, Ranked
@@ -30,7 +29,7 @@ from grounded.diagnosis.validation.certainty import (
     moved_parameters,
 )
 from grounded.diagnosis.validation.decide import Decision
-from grounded.diagnosis.validation.identifiable import Identified, identified
+from grounded.diagnosis.validation.identifiable import Identified, identified, values_of
 from grounded.diagnosis.validation.limits import Limits, constant_inputs
 from grounded.diagnosis.validation.measured import Measured
 from grounded.diagnosis.validation.ruler import Ruler
@@ -171,14 +170,12 @@ class Claims:
     @cached_property
     def _calibrated(self) -> list[tuple[str, float, float, float]]:
         """The calibrated parameters by the fit: name, value, standard deviation, half-width."""
-        h, model = self.best.hypothesis, self.data.model
-        if h.spread == 0 or h.shift is None:
-            return []
-        which, scale = calibrated(self.data), param_scale(model)
-        std, half = (a[len(h.theta) :] * scale[which] for a in self.search.sure(self.best))
-        values = (model.values + h.shift)[which]
-        names = [model.param_names[i] for i in which]
-        return [*zip(names, *(a.tolist() for a in (values, std, half)), strict=True)]
+        values = values_of(self.best.hypothesis, self.data)
+        return [
+            (one.quantity, one.value, float(std) * one.scale, float(half) * one.scale)
+            for one, std, half in zip(values, *self.search.sure(self.best), strict=True)
+            if not one.effect
+        ]
 
     def groups(self) -> tuple[tuple[str, ...], ...]:
         """Return groups of indistinguishable explanations, the claimed one first in each.

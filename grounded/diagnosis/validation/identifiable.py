@@ -20,18 +20,20 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from grounded.diagnosis.error_report import Combination, Identifiable
 from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.levels import HALF, WELL
+from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
 from grounded.diagnosis.likelihood.intervals import fisher
 from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
-from grounded.effects import ParamFamily
 from grounded.filter import kalman
 from grounded.frozen import Array
 from grounded.model import Model
@@ -42,6 +44,37 @@ PRIOR_SHARE = 0.2  # of a value's variance, from which on it rests on a prior
 QUIETER = 100.0  # factor by which effects may still reduce the noise variance
 
 Key = tuple[str, str]  # of a value: effect and quantity, or "" and parameter
+
+
+class Value(NamedTuple):
+    """A free value of a hypothesis, which is a column of its information."""
+
+    effect: str  # "" for a parameter of the model
+    quantity: str  # or the parameter
+    unit: str
+    value: float
+    scale: float = 1.0  # units of the value per unit of the column
+
+    @property
+    def key(self) -> Key:
+        """The effect and the quantity."""
+        return self.effect, self.quantity
+
+
+def values_of(h: Hypothesis, data: Data) -> list[Value]:
+    """Return the free values of a hypothesis in the order of its columns, parameters last."""
+    found = [
+        Value(effect.name, q.name, q.unit, float(values[q.name]))
+        for effect, values in h.pairs
+        for q in effect.free
+    ]
+    model, sizes = data.model, param_scale(data.model)
+    now = model.values + (0.0 if h.shift is None else h.shift)
+    for i in calibrated(data) if h.spread > 0 else ():
+        name = model.param_names[i]
+        unit = model.params[name].unit
+        found.append(Value("", name, unit, float(now[i]), float(sizes[i])))
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,23 +118,20 @@ def identified(
             adopted jointly.
     """
     model, known = predictor.data.model, known or {}
-    G, keys = _information(predictor, fit)
-    k, names = (
-        sum(bool(effect) for effect, _ in keys),
-        [name for effect, name in keys if not effect],
-    )
+    G, values = _information(predictor, fit)
+    names = [one.quantity for one in values if not one.effect]
     if not names:
         return Identified()
-    C = _inverse(G + np.diag([float(not effect) for effect, _ in keys]))
-    priors = np.array([model.params[name].spread for name in names])
+    k, keys = len(values) - len(names), [one.key for one in values]
+    C = _inverse(G + np.diag([float(not one.effect) for one in values]))
+    unit, value = np.array([(one.scale, one.value) for one in values]).T
+    priors, std = unit[k:], np.sqrt(np.diag(C))
     parts = C[:, k:] ** 2 / np.maximum(np.diag(C), 1e-300)[:, None]
     parts[parts < PRIOR_SHARE] = 0.0
     rests = parts.sum(axis=1) > HALF
 
     # values that stand where the priors put them, in groups
-    unit = np.concatenate([np.ones(k), priors])
-    value, std = _values(fit, predictor, keys) / unit, np.sqrt(np.diag(C))
-    lone = rests & (fisher(G) > ALONE * std) & (std > WELL * np.abs(value))
+    lone = rests & (fisher(G) > ALONE * std) & (std * unit > WELL * np.abs(value))
     pins = {
         i: {k + j for j in np.flatnonzero(parts[i]).tolist()} for i in np.flatnonzero(lone).tolist()
     }
@@ -148,54 +178,36 @@ def held(predictor: Predictor, fit: Fitted, less_noise: float = QUIETER) -> Mode
         less_noise: factor by which the variance of the noise may still fall.
     """
     model = predictor.data.model
-    G, keys = _information(predictor, fit)
-    own = [i for i, (effect, _) in enumerate(keys) if effect]
-    free = [i for i, (effect, _) in enumerate(keys) if not effect]
-    sure = {
-        i: model.params[keys[i][1]].spread / max(abs(model.params[keys[i][1]].value), 1e-9)
-        for i in free
-    }
-    names = {keys[i][1] for i in free}
+    G, values = _information(predictor, fit)
+    own = [i for i, one in enumerate(values) if one.effect]
+    free = [i for i, one in enumerate(values) if not one.effect]
+    names = {i: values[i].quantity for i in free}
+    sure = {i: values[i].scale / max(abs(model.params[names[i]].value), 1e-9) for i in free}
     while free:
-        some = [*own, *free]
-        prior = np.diag([0.0] * len(own) + [1.0] * len(free))
-        C = _inverse(less_noise * G[np.ix_(some, some)] + prior)
-        left = np.sqrt(np.diag(C))[len(own) :]
+        some, prior = [*own, *free], np.diag([0.0] * len(own) + [1.0] * len(free))
+        left = np.sqrt(np.diag(_inverse(less_noise * G[np.ix_(some, some)] + prior)))[len(own) :]
         lost = [i for i, share in zip(free, left, strict=True) if share > UNKNOWN]
         if not lost:
             break
         free.remove(min(lost, key=lambda i: sure[i]))
-    return model.holding(names - {keys[i][1] for i in free})
+    return model.holding({name for i, name in names.items() if i not in free})
 
 
-def _information(predictor: Predictor, fit: Fitted) -> tuple[Array, list[Key]]:
-    """Return the data's information on values and uncertain parameters, and their keys.
+def _information(predictor: Predictor, fit: Fitted) -> tuple[Array, list[Value]]:
+    """Return the data's information on values and uncertain parameters, and these.
 
     The values of the effects come first, without those that are parameters themselves; parameters
     are in units of their priors.
     """
-    data, h = predictor.data, fit.hypothesis
-    keys = [(e.name, q.name) for e in h.effects for q in e.free]
-    kept = [not isinstance(e.family, ParamFamily) for e in h.effects for _ in e.free]
-    keys += [("", data.model.param_names[i]) for i in calibrated(data)]
-    free = replace(fit, hypothesis=replace(h, spread=1.0))
+    free = replace(fit, hypothesis=replace(fit.hypothesis, spread=1.0))
     columns, of_log = base_columns(predictor, free, whole=True)
     if not columns.shape[-1]:
         return np.zeros((0, 0)), []
     white = kalman.innovations(filter_of(predictor, fit), columns, of_log)[0]
-    W = np.nan_to_num(white.reshape(-1, columns.shape[-1]))
-    own = np.flatnonzero([*kept, *[True] * (len(keys) - len(kept))])
-    return np.asarray(W[:, own].T @ W[:, own]), [keys[i] for i in own]
-
-
-def _values(fit: Fitted, predictor: Predictor, keys: Sequence[Key]) -> Array:
-    """Return the values of a fit by key, each in its unit."""
-    h, model = fit.hypothesis, predictor.data.model
-    now = model.values + (0.0 if h.shift is None else h.shift)
-    known = dict(zip((("", name) for name in model.param_names), now, strict=True))
-    for effect, values in h.pairs:
-        known |= {(effect.name, q.name): values[q.name] for q in effect.free}
-    return np.array([known[key] for key in keys])
+    values = values_of(free.hypothesis, predictor.data)
+    own = [i for i, one in enumerate(values) if not one.effect.startswith("parameter:")]
+    W = np.nan_to_num(white.reshape(-1, columns.shape[-1]))[:, own]
+    return np.asarray(W.T @ W), [values[i] for i in own]
 
 
 def _inverse(A: Array) -> Array:
