@@ -12,6 +12,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import accumulate
 from typing import Any, TextIO
 
 from grounded.findings.finding import Finding, Weight
@@ -238,33 +239,30 @@ def table(rows: Sequence[Sequence[str]], header: Sequence[str]) -> str:
     A table wider than the terminal wraps its headers at blanks, then its cells. Columns that still
     do not fit go into a second table with the same first column.
     """
-    body = [[cell.replace("\n", "?") for cell in row] for row in rows]
+    lines = [[cell.replace("\n", "?") for cell in row] for row in (header, *rows)]
     for gap in (2, 1):
-        widths = _fit([list(header), *body], gap)
-        kept = _reach(widths, gap)
-        if kept == len(widths):
+        widths = _fit(lines, gap)
+        ends = [end - gap for end in accumulate(width + gap for width in widths)]
+        kept = max(2, sum(end <= columns() for end in ends))
+        if kept >= len(widths):
             break
     if kept < len(widths):
-        parts = [
-            [[row[0], *row[k]] for row in (header, *body)]
-            for k in (slice(1, kept), slice(kept, None))
-        ]
+        parts = [[[row[0], *row[k]] for row in lines] for k in (slice(1, kept), slice(kept, None))]
         return "\n\n".join(table(part[1:], part[0]) for part in parts)
-    left = [i == 0 or _words([row[i] for row in body]) for i in range(len(widths))]
+    left = [i == 0 or _words([row[i] for row in lines[1:]]) for i in range(len(widths))]
     out = []
-    for k, row in enumerate([list(header), *body]):
+    for k, row in enumerate(lines):
         cells = [_broken(cell, width) for cell, width in zip(row, widths, strict=True)]
         tall = max(map(len, cells), default=0)
         for j in range(tall):
-            text = ""
-            for i, lines in enumerate(cells):
-                at = j - (tall - len(lines)) if k == 0 else j  # headers are aligned at the bottom
-                cell = lines[at] if 0 <= at < len(lines) else ""
-                pad = " " * (widths[i] - len(cell))
-                text += " " * gap * (i > 0) + (
-                    tinted(cell) + pad if left[i] else pad + tinted(cell)
-                )
-            out.append(style(text.rstrip()) if k == 0 else text.rstrip())
+            texts = []
+            for cell, width, to_left in zip(cells, widths, left, strict=True):
+                at = j - (tall - len(cell)) if k == 0 else j  # headers are aligned at the bottom
+                part = cell[at] if 0 <= at < len(cell) else ""
+                pad = " " * (width - len(part))
+                texts.append(tinted(part) + pad if to_left else pad + tinted(part))
+            text = (" " * gap).join(texts).rstrip()
+            out.append(style(text) if k == 0 else text)
     return "\n".join(out)
 
 
@@ -277,7 +275,7 @@ def _fit(lines: list[list[str]], gap: int) -> list[int]:
             max([_longest(name), *(len(c) if whole else _longest(c) for c in cells)])
             for name, *cells in across
         ]
-        while _total(widths, gap) > columns() and widths != least:
+        while sum(widths) + gap * (len(widths) - 1) > columns() and widths != least:
             loose = [w * (w > n) for w, n in zip(widths, least, strict=True)]
             widths[loose.index(max(loose))] -= 1
     return widths
@@ -286,17 +284,6 @@ def _fit(lines: list[list[str]], gap: int) -> list[int]:
 def _longest(cell: str) -> int:
     """Return the length of the longest unbreakable part of a cell."""
     return max(map(len, glued(cell).split(" ")))
-
-
-def _total(widths: Sequence[int], gap: int) -> int:
-    return sum(widths) + gap * (len(widths) - 1)
-
-
-def _reach(widths: Sequence[int], gap: int) -> int:
-    """Return how many columns fit side by side on the terminal, at least two."""
-    whole = range(len(widths), 2, -1)
-    fitting = (k for k in whole if _total(widths[:k], gap) <= columns())
-    return next(fitting, min(len(widths), 2))
 
 
 def _words(cells: Sequence[str]) -> bool:
