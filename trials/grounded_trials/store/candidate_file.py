@@ -137,7 +137,8 @@ def read_candidate(
         raise wrong(f"{own.name}: policy, states and inputs", sizes, shape=str(wants))
     for topic in ("/policy", "/predicted_state", "/predicted_input"):
         own.check_grid(topic, 0, policy.dt)
-    _refuse_rewritten(own, [*_controls(policy), x, u])
+    if own.meta.get("sha256") not in (None, _hash(own.meta, [*_controls(policy), x, u])):
+        raise refused("file.changed", own.name, what="candidate", then=NextCommand("propose"))
     return policy, x, u, own.meta
 
 
@@ -174,12 +175,6 @@ def _hash(table: Meta, arrays: Iterable[Array]) -> str:
         digest.update(repr(array.shape).encode())
         digest.update(np.ascontiguousarray(array + 0.0, dtype="<f8").reshape(-1).data)
     return digest.hexdigest()
-
-
-def _refuse_rewritten(own: OwnFile, arrays: Iterable[Array]) -> None:
-    stated, found = own.meta.get("sha256"), _hash(own.meta, arrays)
-    if stated not in (None, found):
-        raise refused("file.changed", own.name, what="candidate", then=NextCommand("propose"))
 
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:

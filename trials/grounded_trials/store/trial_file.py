@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from itertools import zip_longest
 from pathlib import Path
-from typing import IO, TypedDict, Unpack
+from typing import IO, Any
 
 import numpy as np
 
@@ -142,14 +142,14 @@ class TrialWriter:
         self.close()
 
 
-class _About(TypedDict, total=False):
-    state_units: Units
-    input_units: Units
-    start_ns: int
-
-
 def trial_bytes(
-    trial: Trial, meta: Meta, policy: bytes | None = None, **about: Unpack[_About]
+    trial: Trial,
+    meta: Meta,
+    policy: bytes | None = None,
+    *,
+    state_units: Units | None = None,
+    input_units: Units | None = None,
+    start_ns: int = 0,
 ) -> bytes:
     """Return a trial as the bytes of a file; equal arguments give equal bytes.
 
@@ -157,8 +157,9 @@ def trial_bytes(
         trial: states (T+1, n) and inputs (T, m).
         meta: entries of the metadata record besides the reserved ones.
         policy: the bytes of the file of the candidate that was run.
-        **about: `state_units` and `input_units` (name -> unit; "1" where missing), and `start_ns`,
-            the absolute time of t = 0 [ns].
+        state_units: name -> unit; "1" where missing.
+        input_units: the same for the inputs.
+        start_ns: the absolute time of t = 0 [ns].
 
     Raises:
         GroundedError: if an entry of `meta` is reserved.
@@ -167,21 +168,21 @@ def trial_bytes(
     with TrialWriter(
         stream,
         trial.dt,
-        with_units(trial.state_names, about.get("state_units")),
-        with_units(trial.input_names, about.get("input_units")),
+        with_units(trial.state_names, state_units),
+        with_units(trial.input_names, input_units),
         meta,
         candidate=trial.candidate,
         policy=policy,
         start_inputs=trial.start_inputs,
         start_states=trial.start_states,
-        start_ns=about.get("start_ns", 0),
+        start_ns=start_ns,
     ) as writer:
         writer.extend(trial)
     return stream.getvalue()
 
 
 def write_trial(
-    path: str | Path, trial: Trial, meta: Meta, policy: bytes | None = None, **about: Unpack[_About]
+    path: str | Path, trial: Trial, meta: Meta, policy: bytes | None = None, **about: Any
 ) -> None:
     """Write a whole trial atomically; for the arguments see `trial_bytes`.
 
