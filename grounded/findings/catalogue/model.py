@@ -88,11 +88,6 @@ ENTRIES: dict[str, Entry] = {
         "for true values correct the log ([[offset {offset:+.3g}]][[!offset? scale or delay_s]] in "
         "[log.state]) and the robot's program, and remove the effect",
     ),
-    "logged_target": Entry(
-        "note",
-        "target.csv is still the logged drive, {about}",
-        "draw the manoeuvre first (`grounded target --help`), or propose to repeat that drive",
-    ),
     # taken home
     "no_place": Entry(
         "warn",

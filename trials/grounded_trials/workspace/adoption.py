@@ -24,7 +24,7 @@ from grounded.effects import param_name
 from grounded.effects.joint import like_a_load
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
-from grounded.model import all_at_bounds
+from grounded.model import Model, all_at_bounds
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_as, write_document
@@ -39,7 +39,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
 )
 from grounded_trials.workspace.last_fit import fitted_in_vain, last_fit
-from grounded_trials.workspace.new_target import logged_target, to_plan
+from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.readings import changed_since, in_time_now, last_again
 from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_in_model
 
@@ -51,16 +51,6 @@ WRITTEN = 1e-6  # relative difference of a value and what is written of it
 
 Effects = Sequence[Mapping[str, Any]]
 Texts = Mapping[str, tuple[str, ...]]
-
-
-@dataclass(frozen=True)
-class Moved:
-    """A number of the model, or of one of its effects, with two values."""
-
-    called: str  # `m`, or `k of coupling:w<-th`
-    was: float
-    now: float
-    unit: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,7 +90,7 @@ def _names(effects: Effects) -> list[str]:
     return [str(effect["name"]) for effect in effects]
 
 
-def _numbers(effects: Effects) -> Iterator[tuple[str, str, str, float]]:
+def _numbers(effects: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, str, str, float]]:
     """Yield effect, quantity, name as a parameter and value of each number of some effects."""
     for effect in effects:
         name = str(effect["name"])
@@ -124,17 +114,16 @@ def told_parameters(diagnosis: Diagnosis) -> dict[str, Estimate]:
     return {name: e for name, e in known if tells(e, nominal.get(name, math.inf))}
 
 
-def left_behind(diagnosis: Diagnosis) -> dict[str, Moved]:
+def left_behind(diagnosis: Diagnosis) -> dict[str, Estimate]:
     """Return the parameters, also of adopted effects, that changed in the fit but are not adopted.
 
     The prediction errors of the diagnosis include their changes.
     """
-    made, kept = made_from(diagnosis), told_parameters(diagnosis)
-    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(made.adopted)}
+    nominal, kept = made_from(diagnosis).nominal, told_parameters(diagnosis)
     return {
-        name: Moved(called.get(name, name), old, e.value, e.unit)
+        name: e
         for name, e in diagnosis.parameters.items()
-        if name not in kept and (old := made.nominal.get(name)) is not None
+        if name not in kept and (old := nominal.get(name)) is not None
         if abs(e.value - old) > NO_CHANGE * max(abs(old), e.std)
     }
 
@@ -239,8 +228,8 @@ def joined(
         family, _, target = name.partition(":")
         if family == "parameter":
             params[target] = _rounded(nominal.get(target, math.nan) + values["d"])
-        elif name in before:  # a further delay adds to the adopted one
-            old[name]["d"] = _rounded(float(before[name]["d"]) + values["d"])
+        elif name in before:  # a further delay adds to the adopted one, if that still is
+            old.get(name, {})["d"] = _rounded(float(before[name]["d"]) + values["d"])
         else:
             new.append({"name": name} | {q: _rounded(value) for q, value in values.items()})
     own, both = settled(params, [*old.values(), *new])
@@ -313,10 +302,16 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
             *(name for name in names if name in diagnosis.combined),
         ),
         along=tuple(name for name in names if name not in asked),
-        left={name: one.now for name, one in left.items()},
+        left={name: one.value for name, one in left.items()},
         then=to_plan(workspace),
     )
-    told = [*_told(workspace, done, asked, left)]
+    named = [effect for effect in adopted if effect["name"] in asked]
+    told = [*_readings(workspace.base_model, named)]
+    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(before.values())}
+    for name, e in left.items():
+        kept, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
+        told.append(found("model.not_told", called.get(name, name), kept=kept, value=value))
+    told += [found("model.along", *done.along)] if done.along else []
     instead = [] if claimed else asked[:1]
     beside = [name for name in _names(adopted) if name not in fitted]
     told += [found("model.beside", *some) for some in (instead, beside) if some]
@@ -379,37 +374,19 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
     return not rivals
 
 
-def _told(
-    workspace: Folder, done: Adopted, asked: Sequence[str], left: Mapping[str, Moved]
-) -> Iterator[Finding]:
-    """Yield what an adoption leaves to be done or known.
-
-    Args:
-        workspace: the workspace.
-        done: the adoption.
-        asked: the effects that the user named.
-        left: the parameters that changed in the fit and are not adopted.
-    """
-    for effect in done.effects:
+def _readings(model: Model, effects: Effects) -> Iterator[Finding]:
+    """Yield which states are in readings of their sensors, once these effects are adopted."""
+    for effect in effects:
         family, _, state = str(effect["name"]).partition(":")
         size = effect.get("b", effect.get("k", 0.0))
         way = "low" if size < 0 else "high"
-        if effect["name"] not in asked:
-            continue
         if family == "sensor_bias":
-            bias = Quantity(abs(size), workspace.base_model.states[state])
+            bias = Quantity(abs(size), model.states[state])
             yield found("model.readings", state, bias=bias, way=way, offset=-size)
         elif family == "sensor_scale":
             yield found("model.readings", state, by=abs(size), way=way)
         elif family == "sensor_delay":
             yield found("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
-    if done.along:
-        yield found("model.along", *done.along)
-    for one in left.values():
-        kept, value = (Quantity(value, one.unit) for value in (one.was, one.now))
-        yield found("model.not_told", one.called, kept=kept, value=value)
-    if not workspace.candidate_ids() and (logged := logged_target(workspace)):
-        yield found("model.logged_target", logged)
 
 
 def undo_adoption(workspace: Folder) -> Undone:
