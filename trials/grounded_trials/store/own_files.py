@@ -148,12 +148,15 @@ class OwnFile:
                 raise unknown(what, name, type.by_name, where)
         numbers = [(type.by_name[name].number, size) for name, size in sizes.items()]
         tags = [(doubles_tag(n, size) if listed else double_tag(n), size) for n, size in numbers]
-        read = (uniform_doubles(b.buffer, b.starts, b.ends, tags) for b in batches)
-        uniform = [values for values in read if values is not None]
         if not batches:
             return [np.zeros((0, size)) for size in sizes.values()]
-        if len(uniform) == len(batches):
-            return [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
+        # of an open-loop policy only the first list is there
+        for some in (tags, tags[:1]) if listed else (tags,):
+            read = [uniform_doubles(b.buffer, b.starts, b.ends, some) for b in batches]
+            uniform = [values for values in read if values is not None]
+            if len(uniform) == len(batches):
+                found = [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
+                return found + [np.zeros((0, size)) for _, size in tags[len(some) :]]
         # laid out otherwise: it may take long
         return within(self.name, len(self.data), self._fields, topic, type, batches, sizes)
 
