@@ -11,9 +11,8 @@ steps:
     3. Of the supported sets that the reference predicts no better than, by the same test of
        predictions, the smallest is chosen: the one-standard-error rule of Breiman et al. (1984),
        and of projection predictive selection (Piironen & Vehtari 2017).
-    4. Of those that are as small, and those that predict better than one of them, the likeliest.
-       Within NATS nats they tie: then a parameter comes before a mechanism, and that before what
-       has no mechanism (`Option.order`).
+    4. Of those that are as small, the likeliest. Within NATS nats they tie: then a parameter comes
+       before a mechanism, and that before what has no mechanism (`Option.order`).
 
 A cause is an effect, or the calibration of the model's own parameters. `benchmarks/decide.py` draws
 each number's curve.
@@ -102,10 +101,7 @@ class Rule:
         near = [option for option in by if self._as_good(option, reference)]
         for size in sorted({len(option.causes) for option in near}):
             small = [o for o in near if len(o.causes) == size and not self.unsupported(o)]
-            if small:  # and what predicts better than one of these
-                least = min(map(self.gained, small))
-                same = [o for o in by if len(o.causes) == size and self.gained(o) >= least]
-                small = [option for option in same if not self.unsupported(option)]
+            if small:
                 break
         most = max(option.evidence for option in small)
         tied = [option for option in small if option.evidence > most - NATS]
