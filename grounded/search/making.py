@@ -13,7 +13,7 @@ from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples
-from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Slopes, Tried, Way
+from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import between_limits, limit_cycle
 from grounded.search.feedback.sample_age import planned_age, run_ages
@@ -38,8 +38,6 @@ GAIN_SHARE, CAUTION_PARTS = 0.5, 12  # of the mean gain to fall below; parts of 
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
 SAME_STEP = 0.2  # relative distance to a run that lost within which a step counts as the same
 WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
-ALIKE = 0.05  # of the incumbent's cost: promises of two plans that differ by less
-FORETOLD = 0.2  # largest error of the plain model at the incumbent, as a fraction of its cost
 
 
 def begun_at(task: Task, trials: Sequence[Trial], predicted: Array) -> Trial:
@@ -83,9 +81,7 @@ class About:
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         self.grounding = ground(plan, own, match_inputs=options.match_inputs)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
-        # without a bias: independent of noise and start
         age = planned_age(planner.task, incumbent, make.ages)
-        self.plain = replace(planner.plan.problem(exact=True), age=age)
         self.real = exact.on(replace(plan.problem(exact=True), age=age))
         self.theta = planner.widened(incumbent.candidate.policy)
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
@@ -108,7 +104,6 @@ class About:
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
-        self.plainly = predicted(self.plain, incumbent.candidate.policy).utility
         self.promised: list[float] = []  # gains of steps that were too small
         self.doubted: Candidate | None = None  # a step that is not made for its likely error
 
@@ -244,26 +239,13 @@ class About:
         own, cost = self._disturbed([self.incumbent.candidate.policy, made.policy])
         return replace(made, likely_off=max(made.likely_off, made.predicted_gain - (own - cost)))
 
-    @property
-    def _plain_off(self) -> float:
-        """Error of the plain model, without a bias, at the incumbent's utility."""
-        return abs(self.plainly - self.incumbent.utility)
-
-    def _plain_gain(self, made: Candidate) -> float | None:
-        """Return the gain predicted by the plain model; None if it mispredicts the incumbent."""
-        if not self._plain_off < FORETOLD * -self.incumbent.utility:
-            return None
-        return predicted(self.plain, made.policy).utility - self.plainly
-
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """Return the changed model's own plan if its predicted gain exceeds the rival's.
 
         The plan of the crude model may lie near another local optimum than that of the better
         model, where local steps from it can't go. Both are judged by the grounded prediction less
-        its likely error, and the own plan also by the changed model alone if that predicts the
-        incumbent's trial (`_worth`). No gain is required if that trial failed badly or was a limit
-        cycle, since a bias measured there does not apply to other runs; but if that predicts a
-        loss, a step that promises about as much goes first.
+        its likely error. No gain is required if the incumbent's trial failed badly or was a limit
+        cycle, since a bias measured there does not apply to other runs.
 
         Args:
             rival: the best step along a direction; None if there is none.
@@ -276,35 +258,10 @@ class About:
         made = self._told(self.candidate(for_late_samples(policy, self.real), Step(), "own plan"))
         promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
-        better = swung and self._goes_first(made, rival)
-        better = better or self._worth(made) > max(promise, self.least)
-        proposal = make.checked(make.with_margin(made, self.real)) if better else None
-        return proposal if proposal is not None and proposal.candidate is not None else None
-
-    def _goes_first(self, made: Candidate, rival: Proposal | None) -> bool:
-        """Return whether an own plan goes before a step, after an incumbent that swung.
-
-        It need not promise more, unless the grounded model predicts that it loses: an arm slammed
-        on such a plan, and stood on its target after a step that promised as much.
-        """
-        gains = made.predicted_utility > self.incumbent.utility
-        if rival is None or rival.candidate is None or gains:
-            return True
-        more = predicted(self.plain, made.policy).utility - rival.candidate.predicted_utility
-        return bool(more > ALIKE * -self.incumbent.utility)
-
-    def _worth(self, made: Candidate) -> float:
-        """Return the likely gain of an own plan: the larger of the estimates of two models.
-
-        The first is the grounded model's gain less its likely error. The second is the gain in the
-        changed model alone, less its error at the incumbent. It is used only if that model predicts
-        the incumbent without a bias, the grounded model predicts a gain too (else a drift car
-        diverged), and the gain is not small: in its own model a plan always gains something.
-        """
-        plainly = self._plain_gain(made) if made.predicted_gain > self.least else None
-        sure = -np.inf if plainly is None else plainly - self._plain_off
-        little = sure <= DOUBTFUL_GAIN * -self.incumbent.utility
-        return made.expected_gain if little else max(made.expected_gain, sure)
+        if not (swung or made.expected_gain > max(promise, self.least)):
+            return None
+        proposal = make.checked(make.with_margin(made, self.real))
+        return proposal if proposal.candidate is not None else None
 
 
 @dataclass(frozen=True, eq=False)

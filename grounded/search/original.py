@@ -15,11 +15,12 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.frozen import Array
-from grounded.search.making import FORETOLD, About
+from grounded.search.making import About
 from grounded.search.planner import Planner
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 
+FORETOLD = 0.2  # largest error of the original model at the incumbent, as a fraction of its cost
 BLOCK = 10  # steps over which misses are summed
 
 

@@ -31,7 +31,7 @@ mispredictions that law 1 leaves in the held-out parts of the run.
 
 Laws of first order hold in a neighbourhood. So runs that strayed from it (`strayed`) correct
 nothing: one run with a motor wired the wrong way round gave derivatives whose step lost six times
-the best cost. And corrected derivatives must still replay the incumbent from s_0.
+the best cost.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
 from grounded.rollout import Run, apart, augmented
 from grounded.search.candidate import Tried
-from grounded.search.planner import Planner, predicted
+from grounded.search.planner import Planner
 from grounded.search.step.corrected import Corrected, runs
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
@@ -61,7 +61,6 @@ LATEST = 100  # latest trials that these are chosen from
 DEAD = 1e-4  # regularisation, relative to the mean square effect of the inputs
 WORST = 1e12  # cost of a run that diverges
 STRAYED = 100.0  # factor on the costs promised and best so far: a run that misses by more strayed
-ASTRAY = 3.0  # a model that gives the incumbent more than this times its cost does not replay it
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,13 +167,11 @@ def believed(
         )
     misses = float(np.mean(crude)), float(np.mean(corrected))
     share = misses[1] / (sum(misses) + 1e-300)
-    if not (replays := _replays(made.problem, incumbent, grounded)):
-        share = 1.0
     both = (
         Alternative(share, grounded, off),
         Alternative(1.0 - share, made.problem, unexplained),
     )
-    plain = misses[0] <= misses[1] or not replays
+    plain = misses[0] <= misses[1]
     model, missed = (Believed(grounded), misses[0]) if plain else (made, misses[1])
     return replace(model, missed=missed, alternatives=both)
 
@@ -201,13 +198,6 @@ def strayed(tried: Tried, best: Tried) -> bool:
     """
     cost = max(abs(tried.promised), abs(best.utility), 1e-9)
     return tried.promised - tried.utility > STRAYED * cost
-
-
-def _replays(problem: Problem, incumbent: Tried, grounded: Problem) -> bool:
-    """Return whether corrected derivatives give the incumbent's policy about its cost from s_0."""
-    policy = incumbent.candidate.policy
-    cost = max(-incumbent.utility, -predicted(grounded, policy).utility)
-    return -predicted(problem, policy).utility <= ASTRAY * cost
 
 
 def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:

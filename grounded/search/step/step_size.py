@@ -46,7 +46,6 @@ from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 KEPT_PROMISE, BROKEN_PROMISE = 0.9, 0.25
 EASED, RAISED = 30.0, 10.0
 SMALLEST_DAMPING, LARGEST_DAMPING = 1e-6, 1e3
-BOLDER = 3  # factors of 10 below the due damping, tried if the due step and all after it lose
 Method = Literal["ddp", "policy-gradient"]
 Stepping = Literal["damped", "full"]
 METHODS, STEPS = get_args(Method), get_args(Stepping)
@@ -190,13 +189,10 @@ class SearchOptions:
         return after_success(Step(made.damping, made.alpha), made.predicted_gain, real)
 
     def steps_from(self, step: Step | None) -> Iterator[Step]:
-        """Yield the due step, then ever more cautious steps, then steps bolder than the first."""
-        first = step
+        """Yield the due step, then ever more cautious steps."""
         while step is not None:
             yield step
             step = self.next_step(step)
-        if first is not None and self.damps:
-            yield from (Step(first.damping / 10.0**k) for k in range(1, BOLDER + 1))
 
 
 def losers_of(
