@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import click
 
 from grounded.errors import NextCommand
-from grounded.findings import found
+from grounded.findings import Finding, Weight, found
 from grounded.model import Model
 from grounded_cli.console import options
 from grounded_cli.console.options import command, flag, json_asked, values_by_name
@@ -56,7 +56,8 @@ def ingest(
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, **about))
         if not json_asked():  # each at once, since the next one may be refused
-            _tell(name, done[-1], workspace.base_model, details)
+            earlier = [note for one in done[:-1] for note in one.findings]
+            _tell(name, done[-1], workspace.base_model, details, earlier)
     yield {"trials": [one.to_json() for one in done]}
     show(f"\n{next_line(done[-1].then)}")
 
@@ -95,10 +96,15 @@ def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRu
         show(next_line(NextCommand("next", ("LOG",))))
 
 
-def _tell(name: str, one: Ingested, model: Model, details: bool) -> None:
+def _tell(
+    name: str, one: Ingested, model: Model, details: bool, earlier: Sequence[Finding] = ()
+) -> None:
+    """Print what became of a log; without details no note that was told of one before it."""
     if one.known:
         show(f"{name}: {one.trial}, stored before")
-    tell(one.findings, name, most=len(one.findings) if details else FINDINGS_TOLD)
+    told = {(note.code, note.about) for note in earlier if note.weight is Weight.NOTE}
+    new = [note for note in one.findings if details or (note.code, note.about) not in told]
+    tell(new, name, most=len(new) if details else FINDINGS_TOLD)
     if not one.known:
         show(f"{name}: {one.trial}")
     if not one.candidate:

@@ -43,7 +43,7 @@ ENTRIES: dict[str, Entry] = {
         "to {share:%}: its feedback made the inputs swing]][[iteration {iteration}: {step} from "
         "{base}]][[corrected? , with derivatives corrected by the trials]][[gentle? , its gains as "
         "low as ran without oscillating]][[original? , by the model without the adopted effects, "
-        "whose steps kept too little of what they promised]], {seconds}",
+        "which tells the runs that lost better]], {seconds}",
     ),
     "predicted": Entry(
         "note",
