@@ -3,6 +3,5 @@
 Read `proposing.py` first (propose and status); `search_state.py` derives where the search stands,
 also without some trials. `handover.py` checks each candidate before it
 leaves, for `exporting.py` (other programs) and `running.py` (the robot, or a simulated one).
-`first_plan.py` and `at_rest.py` tell before the first run what the configuration lacks, and what a
-plan lacks to end at rest.
+`first_plan.py` and `at_rest.py` tell before the first run what the configuration lacks.
 """

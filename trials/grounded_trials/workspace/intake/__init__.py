@@ -5,8 +5,8 @@ after it:
 
 recognising/  did it run its candidate? What is refused, and what it is instead
 remarks/      what the user is told about a trial that is stored
-opening/      reading a file: a trial written by grounded, or any other log through [log]
-locating/     where in a log the run begins, and where it failed
+opening/      reading a file, a trial written by grounded or any other log through [log]; where in
+              it the run begins
 
 How a run's commands may have come about is one table, in `grounded.accounts.returned`.
 """
