@@ -305,11 +305,6 @@ class _Table:
         if len(free) <= (UNNAMED_BESIDE if first else UNNAMED_AT_ALL):
             own |= {name: self._possible(name, free) for name in bare}
         like = self._likes(own[q], own[w])
-        if not (bare or like) and len(free) <= UNNAMED_AT_ALL:  # a name may mislead
-            more = self._likes(own[q][:1], self._possible(w, free))
-            like |= more
-            for path in own[w] if more else ():
-                self.add(w, path, -CAP)
 
         # Each gains what the best pair that it is in explains, less what its partner lacks.
         before, gains = self.points.copy(), dict[tuple[str, str], float]()

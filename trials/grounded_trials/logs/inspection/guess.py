@@ -27,11 +27,6 @@ class Guess:
     scale: float = 1.0  # factor on its values: degrees, or a sign
 
     @property
-    def is_angle(self) -> bool:
-        """Whether its values come from an orientation and wrap."""
-        return self.path.endswith(tuple(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")))
-
-    @property
     def extent(self) -> tuple[float, float] | None:
         """Its lowest and highest value in the log, in the model's unit; None if unknown."""
         if self.field is None or self.field.low is None or self.field.high is None:
