@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import combinations
 from pathlib import Path
 
@@ -134,7 +135,7 @@ class LogReport:
         """Paths of the numbers that take more than one value."""
         return [field.path for field in self.numbers if field.low != field.high]
 
-    @property
+    @cached_property
     def findings(self) -> tuple[Finding, ...]:
         """What is odd about the log, besides its damage."""
         return _findings(self)
