@@ -8,7 +8,7 @@ Every number has points for every role, the sum of named evidence:
     joint       the names and the order of joints                          (`joint_names`)
     home        states come from one message rather than from many, and often
     derivative  where the model has dq/dt = w, w follows q in the samples  (`relations`)
-    motion      the model's steps, among assignments that are left         (`steps`)
+    motion      the model's steps, of inputs that are left                (`relations`)
 
 `linear_sum_assignment` takes the assignment of most points, so that no guess overwrites another.
 What leads its rivals by `SURE_LEAD` and rests on more than one unit or an order is sure; the rest
