@@ -98,6 +98,14 @@ ADOPTIONS = {  # a diagnosis, what is then known only jointly, and what stays be
         [],
         {"mass": 1.4},
     ),
+    "a loss that was 0, and is within its +-": (
+        {
+            "diagnosed": MADE | {"nominal": {"mass": 0.0}},
+            "parameters": {"mass": {"value": 0.3, "std": 0.5, "unit": "kg"}},
+        },
+        [],
+        {"mass": 0.3},
+    ),
     "a parameter known with others": (
         {"identifiable": [{"parameter": "mass", "verdict": "not identifiable", "jointly": True}]},
         ["mass"],

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import partial
+from importlib import metadata
 from typing import Any
 
 from grounded.checks import of_type, wrong
@@ -44,10 +45,8 @@ def installed_effects() -> Library:
     Raises:
         GroundedError: for an entry point that can't be loaded or holds something else.
     """
-    from importlib.metadata import entry_points
-
     found: list[Family] = []
-    for point in entry_points(group="grounded.effects"):
+    for point in metadata.entry_points(group="grounded.effects"):
         try:
             loaded = point.load()
         except Exception as error:

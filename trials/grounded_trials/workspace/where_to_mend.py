@@ -41,13 +41,18 @@ def where_to_mend(
     findings = _at_limits(workspace, used, findings)
     fed = workspace.config.task.feedback
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
+
+    def either(one: Finding) -> said.Finding:  # by whether the robot's program gets it as late
+        other = one.said.facts.get("message") if one.said else None
+        return said.found("sensor.mend", one.signal, log=one.log, of=other)
+
     if read:
         strange = misread(workspace.base_model, workspace.log_mapping)
         odd = [Finding(one.about[0], one, "mismatch") for one in strange]
         by = readings_of(read[-1])
         whole = (replace(one, keys=_whole(one, by)) for one in (*odd, *findings))
         return tuple(
-            replace(one, mend=_either(one)) if fed and one.keys and late_effects([one]) else one
+            replace(one, mend=either(one)) if fed and one.keys and late_effects([one]) else one
             for one in whole
         )
     how = {"delay": "late", "lag": "late", "sign": "sign", "degrees": "degrees"}
@@ -59,12 +64,6 @@ def where_to_mend(
     return tuple(
         mended(one, how[one.kind]) if one.corrected and one.kind in how else one for one in findings
     )
-
-
-def _either(one: Finding) -> said.Finding:
-    """Return what to do about a late sensor, by whether the robot's program gets it as late."""
-    other = one.said.facts.get("message") if one.said else None
-    return said.found("sensor.mend", one.signal, log=one.log, of=other)
 
 
 def _whole(finding: Finding, by: Mapping[str, Reading]) -> Mapping[str, Any]:

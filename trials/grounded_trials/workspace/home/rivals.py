@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -204,9 +203,7 @@ def _rival(workspace: Folder, text: str) -> Rival:
 def _of_file(workspace: Folder, path: Path) -> Rival:
     """Return the model of an MJCF or URDF file; its delays and lags are latency and effects."""
     compiled, effects = simulated_model(path)
-    step = workspace.base_model.step
-    own = step if isinstance(step, MujocoStepper) else None
-    model = numbers_of_file(compiled, (), own)
+    model = numbers_of_file(workspace, compiled)
     late = getattr(model.step, "latency", {})
     return Rival(str(path), model, effects, late, compiled)
 
@@ -233,12 +230,10 @@ def _aligned(workspace: Folder, one: Rival, other: Rival) -> tuple[Rival, Rival]
         pair = [
             replace(rival, compiled=rival.compiled or _compiled(rival)) for rival in (one, other)
         ]
-        step = workspace.base_model.step
-        own = step if isinstance(step, MujocoStepper) else None
         files = [rival.compiled for rival in pair if rival.compiled is not None]
         if len(files) == len(pair):
-            make = partial(numbers_of_file, others=files, like=own)
-            one, other = (replace(rival, model=make(rival.compiled)) for rival in pair)
+            models = (numbers_of_file(workspace, rival.compiled, files) for rival in pair)
+            one, other = (replace(r, model=m) for r, m in zip(pair, models, strict=True))
     base = workspace.base_model
     for rival in (one, other):
         same_names(rival.label, "states", rival.model.state_names, base.state_names)
@@ -298,16 +293,16 @@ def simulated_model(path: Path) -> tuple[Any, Effects]:
     return spec.compile(), tuple(effects)
 
 
-def numbers_of_file(
-    compiled: Any, others: Sequence[Any] = (), like: MujocoStepper | None = None
-) -> Model:
+def numbers_of_file(workspace: Folder, compiled: Any, others: Sequence[Any] = ()) -> Model:
     """Return the Model of a compiled file, with the numbers as parameters that files differ in.
 
     Args:
+        workspace: if its model is MuJoCo's, the file's has its inputs, time step and parameters.
         compiled: the file.
         others: files that are compared.
-        like: a stepper whose inputs, time step and parameters it has.
     """
+    step = workspace.base_model.step
+    like = step if isinstance(step, MujocoStepper) else None
     each = [dict(_numbers(one)) for one in others]
     shared = set(each[0]).intersection(*each[1:]) if each else set[str]()
     specs = {
@@ -320,8 +315,8 @@ def numbers_of_file(
         inputs = joints if like.controls.torques else "actuators"
     known = dict(_numbers(compiled))
     params = {spec: known[spec] for spec in sorted(specs) if spec in known}
-    step, without = (None, ()) if like is None else (like.timestep, like.without)
-    return mujoco.model(compiled, params=params, inputs=inputs, without=without, timestep=step)
+    every, without = (None, ()) if like is None else (like.timestep, like.without)
+    return mujoco.model(compiled, params=params, inputs=inputs, without=without, timestep=every)
 
 
 def _numbers(compiled: Any) -> Iterator[tuple[str, float]]:

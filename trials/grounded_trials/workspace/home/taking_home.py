@@ -1,8 +1,8 @@
 """export --model: the model as it is now, in the form that it came in.
 
-A model of MuJoCo is written as its MJCF or URDF file, any other as its model.py. Every other byte
-of the file stays. A comment lists each value with its +-, and the date. What the form can't hold is
-listed with its equation, there and as a finding.
+A model of MuJoCo is written as its MJCF or URDF file, any other as its model.py. Comments, order
+and layout of the file stay. A comment lists each value with its +-, and the date. What the form
+can't hold is listed with its equation, there and as a finding.
 """
 
 from __future__ import annotations
