@@ -129,7 +129,7 @@ def test_what_is_adopted_is_what_the_trials_tell(folder, case):
     changes, jointly, left = ADOPTIONS[case]
     w = written(folder, **changes)
     shown = grounded("-C", folder, "adopt", FRICTION)
-    assert shown.code == 0 and all(f"{value:.4g}" in shown.err for value in left.values())
+    assert shown.code == 0 and all(name.split("_")[0] in shown.err for name in left)
     w.undo_adoption()
     done = w.adopt(FRICTION).to_json()
     assert (done["jointly"], done["left"]) == (jointly, left)

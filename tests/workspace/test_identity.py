@@ -114,7 +114,8 @@ def test_joined_workspaces_never_mix_two_policies_of_one_name(w, tmp_path):
     assert len(tried.trials) == 1 and tried.utility == before.standing.history[1].utility
     assert len(w.trials()) > len(before.standing.history)
     (name,) = {t.trial.candidate for t in w.trials() if "~" in t.trial.candidate}
-    assert name.startswith("c0002~") and any("c0002" in note for note in now.notes)
+    assert name.startswith("c0002~")
+    assert "search.uncounted" in {one.code for one in now.findings}
     assert w.verify().damaged == ()
     w.candidate_path("c0002").unlink()  # and the first that ran it has the name
     assert len(w.status().standing.history[1].trials) == 1
