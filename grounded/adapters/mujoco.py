@@ -53,7 +53,7 @@ from grounded.adapters.mujoco_names import (
 from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
 from grounded.checks import refused, unknown, wrong
-from grounded.compile.run.differenced import stencil
+from grounded.compile.run.interpreted import stencil
 from grounded.engine import cores
 from grounded.frozen import Array
 from grounded.model import Model

@@ -105,7 +105,7 @@ def dynamics_of(
     variant: Variant, n: int, m: int, width: int, kind: str, integrator: str
 ) -> Dynamics:
     """The dynamics with derivatives for the first `width` of x, u, p."""
-    entries = {(r, c): i for r, c, i in variant.entries(width)}
+    entries = {(r, c): i for r, c, i in (variant.entries(width) if width else ())}
     stages = STAGES[integrator] if kind == "derivative" else ()
     return Dynamics(variant.trace.graph, variant.trace.outputs, entries, n, m, stages)
 

@@ -84,7 +84,6 @@ class Kernels:
         )
         self._libraries: dict[Any, jit.Library] = {}
         self._lock = threading.RLock()
-        self.too_long = False  # its derivatives by the parameters, to be compiled
 
     def batch(self) -> jit.Library:
         """Step and, unless derivatives are left out, linearise, of many samples."""
@@ -197,6 +196,7 @@ class CompiledSystem(TracedSystem):
         """See `System.sensitivities`."""
         full = self._full(p, dt)
         if full is None:
+            self._too_long.add(self.n + self.m + self.k)
             return super().sensitivities(x, u, p, dt, smoothing)
         N, n = len(x), self.n
         f_x, f_u, f_p = zeros((N, n, n)), zeros((N, n, self.m)), zeros((N, n, self.k))
@@ -206,13 +206,11 @@ class CompiledSystem(TracedSystem):
 
     def _full(self, p: Array, dt: float) -> jit.Library | None:
         """Derivatives by the parameters too; None where they are too many to compile."""
-        kernels = self._compiled(p, dt)
-        if self.n * (self.n + self.m + self.k) > MAX_PLACES or kernels.too_long:
+        if self.n * (self.n + self.m + self.k) > MAX_PLACES or sum(self.sizes) in self._too_long:
             return None
         try:
-            return kernels.full()
+            return self._compiled(p, dt).full()
         except TooLong:
-            kernels.too_long = True
             return None
 
     def _batch(
@@ -304,10 +302,14 @@ class CompiledSystem(TracedSystem):
 
 
 class CompiledSteps(CompiledSystem):
-    """Steps and rollouts compiled, derivatives traced: those of a wide model fill the stack."""
+    """Steps and rollouts compiled, of which derivatives are differences: a large model's."""
 
     how = "compiled steps"
     derivatives = False
+
+    def jacobian(self, at: Samples, width: int) -> Array:
+        """See `Interpreted.jacobian`."""
+        return self.differences(at, width)
 
     slopes = TracedSystem.slopes
     sensitivities = TracedSystem.sensitivities

@@ -23,12 +23,11 @@ import numpy as np
 from grounded.checks import refused, wrong
 from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
 from grounded.compile.problem import Samples
-from grounded.compile.run.interpreted import Interpreted
+from grounded.compile.run.interpreted import RELATIVE_STEP, Interpreted
 from grounded.errors import GroundedError
 from grounded.foreign import contained
 from grounded.frozen import Array
 
-RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))
 SINGLE_STEP = float(np.cbrt(np.finfo(np.float32).eps))
 WRONG = 1e-2  # share of the largest by which a given derivative may differ from differences
 SLOW = (
@@ -40,16 +39,6 @@ SINGLE = (
     "and good to four digits (float64 inside it mends it; in JAX, "
     "jax.config.update('jax_enable_x64', True))"
 )
-CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
-
-
-def stencil(at: Array, h: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """Return the points h below and above `at`, neither of them beyond a limit.
-
-    A point that lies beyond a limit itself is kept, and stepped from inwards.
-    """
-    down = np.maximum(at - h, np.minimum(at, low))
-    return down, np.minimum(at + h, np.maximum(at, high))
 
 
 class DifferencedSystem(Interpreted):
@@ -89,7 +78,9 @@ class DifferencedSystem(Interpreted):
         at = np.unique(np.linspace(0, len(x) - 1, 3).astype(int))
         given = self._given(x[at], u[at], p, dt)
         both, free = np.concatenate([x[at], u[at]], axis=1), np.full(self.n + self.m, np.inf)
-        sides = [self._differences(both, p, dt, *s) for s in ((both, free), (-free, both))]
+        relative, how = self._relative_step(x[at], u[at], p, dt), (p, dt, 0.0)
+        ends = (both, free), (-free, both)
+        sides = [self._slopes_at(both, how, relative, *some) for some in ends]
         off = np.abs(given - np.clip(given, np.minimum(*sides), np.maximum(*sides)))
         if off.max(initial=0.0) > WRONG * np.abs(sides).max(initial=1e-9):
             _, i, j = np.unravel_index(int(np.argmax(off)), off.shape)
@@ -111,29 +102,17 @@ class DifferencedSystem(Interpreted):
         Where derivatives come with the model, those by a parameter are taken to one side: half the
         steps, and none with a friction below zero.
         """
-        x, u, p, dt, _, limits = at
-        shifted = self.n + self.m
-        both, free = np.concatenate([x, u], axis=1), np.full(shifted, np.inf)
-        low, high = -free, free.copy()
-        if limits is not None:
-            low[self.n :], high[self.n :] = limits
-        relative = self._relative_step(x, u, p, dt)
+        x, u, p, dt, *_ = at
+        relative, shifted = self._relative_step(x, u, p, dt), self.n + self.m
+        if self.signature.jacobian is None:
+            return self.differences(at, width, relative)
         J = np.empty((len(x), self.n, width))
-        size = max(1, CHUNK // (2 * shifted))
-        if self.signature.jacobian is not None:
-            J[:, :, :shifted], size = self._given(x, u, p, dt), 0
-        for first in range(0, len(x), size) if size else ():
-            some = slice(first, first + size)
-            J[some, :, :shifted] = self._differences(both[some], p, dt, low, high)
-        given = self.signature.jacobian is not None
-        base = self.step(x, u, p, dt) if given and width > shifted else None
+        J[:, :, :shifted] = self._given(x, u, p, dt)
+        base = self.step(x, u, p, dt) if width > shifted else x
         for i in range(width - shifted):
-            up, down, after = np.array(p, float), np.array(p, float), base
+            up = np.array(p, float)
             up[i] += relative * max(1.0, abs(p[i]))
-            if after is None:
-                down[i] -= relative * max(1.0, abs(p[i]))
-                after = self.step(x, u, down, dt)
-            J[:, :, shifted + i] = (self.step(x, u, up, dt) - after) / (up[i] - down[i])
+            J[:, :, shifted + i] = (self.step(x, u, up, dt) - base) / (up[i] - p[i])
         return J
 
     def _relative_step(self, x: Array, u: Array, p: Array, dt: float) -> float:
@@ -176,21 +155,6 @@ class DifferencedSystem(Interpreted):
         except Exception as error:
             shapes = f"({self.n}, {self.n}), ({self.n}, {self.m})"
             raise wrong(f"{where(own)}: jacobian", got=str(error), shape=shapes) from error
-
-    def _differences(self, both: Array, p: Array, dt: float, low: Array, high: Array) -> Array:
-        """(N, n + m) points -> (N, n, n + m) inside low and high, in one call of the step."""
-        N, d = both.shape
-        relative = self._relative_step(both[:, : self.n], both[:, self.n :], p, dt)
-        h = relative * np.maximum(1.0, np.abs(both))
-        down, up = stencil(both, h, low, high)
-        points = np.broadcast_to(both, (2, d, N, d)).copy()
-        i = np.arange(d)
-        points[0, i, :, i], points[1, i, :, i] = up.T, down.T
-        width = (points[0, i, :, i] - points[1, i, :, i]).T  # what was really stepped (N, d)
-        flat = points.reshape(-1, d)
-        y = self.step(flat[:, : self.n], flat[:, self.n :], p, dt).reshape(2, d, N, self.n)
-        with np.errstate(all="ignore"):
-            return np.asarray((y[0] - y[1]).transpose(1, 2, 0) / width[:, None, :])
 
     def _batch(self, x: Array, u: Array, p: Array, dt: float) -> Array | None:
         """The function on arrays of samples; None when it can't take them."""

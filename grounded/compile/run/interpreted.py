@@ -54,6 +54,18 @@ from grounded.compile.problem import (
 from grounded.compile.trace.tracing import Signature
 from grounded.frozen import Array, wrapped
 
+RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))  # of differences in double precision
+CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
+
+
+def stencil(at: Array, h: Array, low: Array, high: Array) -> tuple[Array, Array]:
+    """Return the points h below and above `at`, neither of them beyond a limit.
+
+    A point that lies beyond a limit itself is kept, and stepped from inwards.
+    """
+    down = np.maximum(at - h, np.minimum(at, low))
+    return down, np.minimum(at + h, np.maximum(at, high))
+
 
 class Interpreted(System):
     """A System whose kernels are NumPy.
@@ -126,6 +138,46 @@ class Interpreted(System):
         J = self.jacobian(Samples(x, u, p, dt, smoothing), sum(self.sizes))
         f_x, f_u, f_p = np.split(J, [self.n, self.n + self.m], axis=2)
         return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
+
+    def differences(self, at: Samples, width: int, relative: float = RELATIVE_STEP) -> Array:
+        """Central differences of `step`, like `jacobian`.
+
+        Args:
+            at: the samples.
+            width: see `jacobian`.
+            relative: their step, relative to a state or an input, or 1, and to a parameter.
+        """
+        x, u, p, dt, eps, limits = at
+        d = self.n + self.m
+        both, high = np.concatenate([x, u], axis=1), np.full(d, np.inf)
+        low = -high
+        if limits is not None:
+            low[self.n :], high[self.n :] = limits
+        J, size = np.empty((len(x), self.n, width)), max(1, CHUNK // (2 * d))
+        for first in range(0, len(x), size):
+            some = slice(first, first + size)
+            J[some, :, :d] = self._slopes_at(both[some], (p, dt, eps), relative, low, high)
+        for i in range(width - d):
+            up, down, h = np.array(p, float), np.array(p, float), relative * (abs(p[i]) or 1.0)
+            up[i], down[i] = p[i] + h, p[i] - h
+            change = self.step(x, u, up, dt, eps) - self.step(x, u, down, dt, eps)
+            J[:, :, d + i] = change / (up[i] - down[i])
+        return J
+
+    def _slopes_at(
+        self, both: Array, how: tuple[Array, float, float], relative: float, low: Array, high: Array
+    ) -> Array:
+        """(N, n + m) points -> (N, n, n + m) inside low and high, in one call of the step."""
+        N, d = both.shape
+        down, up = stencil(both, relative * np.maximum(1.0, np.abs(both)), low, high)
+        points = np.broadcast_to(both, (2, d, N, d)).copy()
+        i = np.arange(d)
+        points[0, i, :, i], points[1, i, :, i] = up.T, down.T
+        width = (points[0, i, :, i] - points[1, i, :, i]).T  # what was really stepped (N, d)
+        flat = points.reshape(-1, d)
+        y = self.step(flat[:, : self.n], flat[:, self.n :], *how).reshape(2, d, N, self.n)
+        with np.errstate(all="ignore"):
+            return np.asarray((y[0] - y[1]).transpose(1, 2, 0) / width[:, None, :])
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""

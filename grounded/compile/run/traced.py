@@ -19,6 +19,7 @@ from grounded.checks import refused
 from grounded.compile.problem import STAGES, Integrator, Samples
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
+from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
 from grounded.frozen import Array
 
@@ -36,6 +37,7 @@ class TracedSystem(Interpreted):
     ) -> None:
         super().__init__(signature, integrator, note)
         self._variants = [Variant(first, self.sizes)] if not first.guards else []
+        self._too_long = set[int]()  # widths of derivatives that are differenced
 
     @cached_property
     def original(self) -> Interpreted:
@@ -81,14 +83,17 @@ class TracedSystem(Interpreted):
             raise refused("model.differs", self.source, state=name, ours=ours, own=own)
 
     def jacobian(self, at: Samples, width: int) -> Array:
-        """See `Interpreted.jacobian`; exact."""
+        """See `Interpreted.jacobian`; exact, or differences where that is too long."""
         x, u, p, dt, smoothing, _ = at
         J = np.empty((len(x), self.n, width))
-        for first in range(0, len(x), CHUNK):
-            some = slice(first, first + CHUNK)
-            with np.errstate(all="ignore"):
-                J[some] = self._chain(x[some], u[some], p, dt, smoothing, width)
-        return J
+        try:
+            for first in range(0, len(x) if width not in self._too_long else 0, CHUNK):
+                some = slice(first, first + CHUNK)
+                with np.errstate(all="ignore"):
+                    J[some] = self._chain(x[some], u[some], p, dt, smoothing, width)
+        except TooLong:
+            self._too_long.add(width)
+        return self.differences(at, width) if width in self._too_long else J
 
     def _chain(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int

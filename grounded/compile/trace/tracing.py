@@ -22,7 +22,6 @@ from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
-from grounded.compile.trace.tangents import Tangents
 from grounded.errors import GroundedError
 from grounded.foreign import contained
 from grounded.frozen import Array
@@ -150,7 +149,7 @@ class Variant:
 
     def __init__(self, found: Trace, sizes: tuple[int, int, int]) -> None:
         self.trace, self.sizes = found, sizes
-        self._known: dict[int, Tangents] = {}
+        self._known: dict[int, tuple[list[tuple[int, int]], Program]] = {}
 
     def _variables(self, width: int) -> list[int]:
         """The leaves of the first `width` of x, u, p."""
@@ -182,10 +181,23 @@ class Variant:
     def linearised(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
     ) -> tuple[Array, Array]:
-        """The outputs (N, r), and their Jacobian by the first `width` of x, u, p (N, r, width)."""
+        """The outputs (N, r), and their Jacobian by the first `width` of x, u, p (N, r, width).
+
+        Raises:
+            TooLong: see `entries`.
+        """
+        outputs = self.trace.outputs
         if width not in self._known:
-            graph, outputs = self.trace.graph, self.trace.outputs
-            self._known[width] = Tangents(graph, outputs, self._variables(width))
+            entries = self.entries(width) if width else []
+            program = Program(self.trace.graph, [*outputs, *(i for _, _, i in entries)])
+            self._known[width] = [(r, c) for r, c, _ in entries], program
+        places, program = self._known[width]
         leaves = _uniform(p, dt) | {("x", i): column for i, column in enumerate(x.T)}
         leaves |= {("u", j): column for j, column in enumerate(u.T)}
-        return self._known[width](leaves, smoothing, len(x))
+        numbers = program(leaves, smoothing)
+        values, J = np.empty((len(x), len(outputs))), np.zeros((len(x), len(outputs), width))
+        for r in range(len(outputs)):
+            values[:, r] = numbers[r]
+        for (r, c), number in zip(places, numbers[len(outputs) :], strict=True):
+            J[:, r, c] = number
+        return values, J
