@@ -211,7 +211,7 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
 @pytest.mark.parametrize(
     "text, holds",
     [
-        ("1,2\n3,4\n", ("1,2", "'t,x,v'")),
+        ("1,2\n3,4\n", ("1,2", "--columns")),
         ("a,b\n3,4\n", ("a and b", "'t'")),
         ("t,b\n0,4\n1\n2,4", ("line 3", "1", "2")),
         ("t,b\n1e30,4\n", ("'t'", "1e+30")),
