@@ -151,13 +151,13 @@ def process_noise(
     for _ in range(ROUNDS):
         if not np.isfinite(best.loglik):
             break
-        trial = _climb(batch, noise, best, visible)
-        after = filtered(model, batch, trial)
-        gain = after.loglik - best.loglik
-        if gain > 0:
-            noise, best = trial, after
-        if not gain > LAST_GAIN:
+        trial, promised = _climb(batch, noise, best, visible)
+        if not promised - best.loglik > LAST_GAIN:
             break
+        after = filtered(model, batch, trial)
+        if not after.loglik > best.loglik:
+            break
+        noise, best = trial, after
     return noise
 
 
@@ -295,8 +295,13 @@ def _enough(records: Sequence[Record]) -> list[Record]:
     return [records[i] for i, rows in zip(order, before, strict=True) if rows < ROWS]
 
 
-def _climb(batch: RecordBatch, noise: NoiseStd, about: Filtered, visible: Array) -> NoiseStd:
-    """Return the likeliest process noise for a fixed linearisation; `visible` (n,): a rough one."""
+def _climb(
+    batch: RecordBatch, noise: NoiseStd, about: Filtered, visible: Array
+) -> tuple[NoiseStd, float]:
+    """Return the likeliest process noise for a fixed linearisation, and its log-likelihood there.
+
+    `visible` (n,) is a rough one.
+    """
     from scipy.optimize import minimize
 
     def there(theta: Array) -> NoiseStd:
@@ -318,7 +323,7 @@ def _climb(batch: RecordBatch, noise: NoiseStd, about: Filtered, visible: Array)
     bounds = list(zip(low, high, strict=True))
     options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
     found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return there(found.x)
+    return there(found.x), -float(found.fun) * batch.count
 
 
 def _spread(values: Array) -> float:
