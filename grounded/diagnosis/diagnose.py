@@ -2,12 +2,13 @@
 
 The stages and their modules:
 
-limits            correct the sensors; what the data can't determine  (accounts)
+limits            correct the sensors; what the data can't show  (accounts)
 attribution       search for effects by evidence   (search, hypotheses, scan, refine, noise, fitted)
 ruler             held-out prediction errors in the channels' units
-decide            choose the claim by the ruler, among hypotheses proposed by evidence
+decide            choose the claim by the ruler, among hypotheses proposed by evidence  (choose)
 measured          errors, noise floor, credit of each cause, leftover; where the gap is
 claims            claimed effects with intervals, ties and look-alikes  (lookalike, certainty)
+identifiable      what the data determine of each value, and what only priors set
 leftover          structure that no effect explains, and a curve that predicts it
 agreement         agreement of the trials; changes between two groups of them
 writer            the result; remarks: its findings and the next step; telling: its lines
