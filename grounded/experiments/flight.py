@@ -143,7 +143,6 @@ def run(
     count: int = 10,
     *,
     first_seed: int = 0,
-    step: str = "damped",
     **how: Unpack[Running],
 ) -> FlightResult:
     """Make Table 1 from `count` runs that are not discarded, seeds first_seed, first_seed + 1 ...
@@ -151,7 +150,6 @@ def run(
     Args:
         count: number of runs, without discarded ones.
         first_seed: first seed of the approximate models.
-        step: "damped" or "full", as in [search].
         how: where the jobs run, see `run_jobs`.
 
     Raises:
@@ -163,7 +161,7 @@ def run(
         if len(found) >= 5 * count:
             raise wrong("flyable models", len(found), low=count)
         missing = count - sum(not r.discarded for r in found)
-        cases = ({"seed": s, "step": step} for s in range(seed, seed + missing))
+        cases = ({"seed": s} for s in range(seed, seed + missing))
         found += run_study(FlightRun, flight_job, cases, **how)
         seed += missing
     path, _, _ = figure8_target()
@@ -176,12 +174,12 @@ def flight_optimum() -> float:
     return -result.cost
 
 
-def flight_job(seed: int, step: str) -> dict[str, Any]:
+def flight_job(seed: int) -> dict[str, Any]:
     """Run one job: one approximate model, five iterations."""
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
     task = flight_task(crude, started_by=aircraft)
-    options = SearchOptions(step="full" if step == "full" else "damped")
+    options = SearchOptions()
     first = propose(task, [], [], options).candidate
     if first is None or unstable(truth, flown := real_flight(truth, first)):
         if first is None:

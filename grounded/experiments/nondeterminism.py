@@ -9,7 +9,6 @@ measured.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Unpack
 
@@ -80,12 +79,11 @@ class NondeterminismResult:
 def run(
     runs: int = RUNS,
     *,
-    levels: Sequence[float] = LEVELS,
     seed: int = 0,
     **how: Unpack[Running],
 ) -> NondeterminismResult:
     """Repeat every sequence `runs` times at each level of scatter."""
-    cases = every(sequence=sequences(), level=levels, runs=[runs], seed=[seed])
+    cases = every(sequence=sequences(), level=LEVELS, runs=[runs], seed=[seed])
     spreads = run_study(EndPointSpread, nondeterminism_job, cases, **how)
     return NondeterminismResult(spreads, runs)
 

@@ -61,7 +61,7 @@ def test_flight_speaks_the_contract(flown):
 
 def test_an_unstable_first_controller_is_discarded(monkeypatch):
     monkeypatch.setattr(flight, "RADIUS", 1.0)
-    result = flight.flight_job(0, "damped")
+    result = flight.flight_job(0)
     assert result["discarded"] and result["trials"] == 1
     assert result["utilities"][0] < -5000
 
@@ -97,7 +97,7 @@ def test_the_model_of_theorem1_is_wrong_by_epsilon():
 
 
 def test_end_points_spread_as_the_paper_says():
-    result = nondeterminism.run(3, levels=(0.0, 1.0, 3.0))
+    result = nondeterminism.run(3)
     document = plain(result)
     by_level = {
         level: [s["largest"] for s in document["spreads"] if s["level"] == level]
