@@ -164,6 +164,6 @@ ENTRIES: dict[str, Entry] = {
     # models that are compared
     # an actuator on its own
     "nothing_found": Entry(
-        "refuse", "nothing is known of {about} beyond the model", "adopt or fit something first"
+        "refuse", "nothing is known of {about} beyond the model: adopt or fit something first"
     ),
 }

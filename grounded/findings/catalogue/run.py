@@ -83,7 +83,7 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "the first command in the log is that of step {steps} of {ran}: those before were not sent "
         "or not logged[[, and {held} held until then]]",
-        "make the program send from step 0 on",
+        CALL,
     ),
     "skipped": Entry(
         "aside",

@@ -44,7 +44,6 @@ ENTRIES: dict[str, Entry] = {
     "mismatch": Entry(
         "warn",
         "does not move as {of} {of:implies/imply} (its rate is off by {off})",
-        "check units, axes and signs",
     ),
     "unresolved": Entry(
         "warn",

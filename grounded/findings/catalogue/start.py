@@ -38,7 +38,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "given": Entry("note", "as you specified"),
     "unused": Entry(
-        "note", "{about} {about:is/are} not used of the log", "[log] can name {about:it/them}"
+        "note", "{about} {about:is/are} not used of the log: [log] can name {about:it/them}"
     ),
     "angles": Entry(
         "note",

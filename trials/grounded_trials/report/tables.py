@@ -367,10 +367,8 @@ def parameter_table(findings: Findings) -> list[Block]:
             found += f", given {listed(rests[name])}"
         written = figure(findings.nominal.get(name))
         rows.append((name, written, figure(param.value), found, shown(param.unit), limits))
-    if not rows:
-        return [Block("text", "The model has no parameters.")]
     header = ("parameter", "in model.py", "now", "diagnosed, 95 %", "unit", "bounds")
-    return [table("parameters", header, rows)]
+    return [table("parameters", header, rows)] if rows else []
 
 
 def _estimated(diagnosis: Diagnosis | None) -> dict[str, Estimate]:
