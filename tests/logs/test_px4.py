@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cli import grounded
-from grounded_trials import Workspace
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
-from rolling import MODEL, ROLL, WANTED, T
+from rolling import ROLL, WANTED, T
 from ulog import ulog
 
 pytest.importorskip("pyulog", reason="needs the extra px4")
@@ -59,12 +57,3 @@ def test_no_variance_and_no_accelerometer_is_a_position(log: Path) -> None:
     assert roll.path == "/vehicle_attitude.q.@rpy.roll"
     others = {path for guess in (x, roll) for path in guess.others}
     assert not [path for path in others if "accel" in path or "var" in path or "eph" in path]
-
-
-@pytest.mark.slow
-def test_three_commands_lead_to_a_diagnosis(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(log.parent)
-    Path("roll.py").write_text(MODEL)
-    assert grounded("init", "quad", "--from", log.name, "--model", "roll.py", "--yes").code == 0
-    assert grounded("-C", "quad", "ingest", "--data", log.name).code == 0
-    assert "tau" in Workspace("quad").diagnose().verdict.parameters
