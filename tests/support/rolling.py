@@ -8,17 +8,3 @@ WANTED = 0.4 * np.sign(np.sin(1.7 * T)) + 0.2 * np.sin(3 * T)  # [rad]
 ROLL = np.zeros(N)  # from level
 for i in range(1, N):
     ROLL[i] = ROLL[i - 1] + (1 - np.exp(-DT / TAU)) * (WANTED[i - 1] - ROLL[i - 1])
-MODEL = """from grounded import Model, Param
-
-
-def dynamics(s, a, p):
-    return {"roll": (a.roll_command - s.roll) / p.tau}
-
-
-model = Model(
-    states={"roll": "rad"},
-    inputs={"roll_command": "rad"},
-    params={"tau": Param(0.5, "s", 0.01, 5.0)},
-    derivative=dynamics,
-)
-"""
