@@ -30,7 +30,6 @@ from grounded.accounts.sent import (
     SAME,
     SLIGHT,
     STEPS_TO_JUDGE,
-    Commanded,
     Following,
     Ran,
     apart,
@@ -568,37 +567,29 @@ def _smoothed(model: Model, own: Ran, trial: Trial) -> Iterator[Row]:
 def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
     """Yield the policy with commands that are cut inside their limits.
 
-    A cut repeats one value to the last digit wherever the policy asks for more, and nowhere else.
+    A cut repeats one value to the last digit wherever the policy asks for more.
     """
-    policy, cuts, cut = own.policy, dict[str, list[float]](), np.zeros(trial.steps, bool)
-    run, low, high = commanded(policy, trial), policy.low.copy(), policy.high.copy()
-    for j, name in enumerate(policy.input_names):
-        for sign, limits in ((-1, low), (1, high)):
-            at = _cut(policy, run, j, sign)
-            if at is not None:
-                limits[j] = run.sent[at, j][0]
-                cuts.setdefault(name, []).append(float(limits[j]))
-                cut[: len(at)] |= at
+    policy, cuts = own.policy, dict[str, list[float]]()
+    run, ends = commanded(policy, trial), np.stack([policy.low, policy.high])
+    cut = np.zeros(len(run.sent), bool)
+    for side, sign in enumerate((-1.0, 1.0)):
+        most = (sign * run.sent).max(axis=0, initial=-np.inf)
+        at = sign * run.sent >= most - FINE**2 * run.size
+        more = sign * run.asked > most + SLIGHT * run.size
+        inside = most < sign * ends[side] - SLIGHT * run.size
+        often = at.sum(axis=0) >= max(STEPS_TO_JUDGE, len(cut) / STEPS_TO_JUDGE / 2)
+        for j in np.flatnonzero(inside & often & ((at & more).sum(axis=0) > 0.8 * at.sum(axis=0))):
+            ends[side, j] = run.sent[at[:, j], j][0]
+            cuts.setdefault(policy.input_names[j], []).append(float(ends[side, j]))
+            cut |= at[:, j]
     # unlike what is sent before a run and after it
-    held = ((low > policy.low) & (low >= policy.past)) | (
-        (high < policy.high) & (high <= policy.past)
-    )
+    held = (ends[0] > policy.low) & (ends[0] >= policy.past)
+    held |= (ends[1] < policy.high) & (ends[1] <= policy.past)
     if cuts and not held.any():
-        at = tuple(f"{n} = {number(v)}" for n, ends in cuts.items() for v in ends)
-        told = found("run.clipped", *cuts, ran=own.id, share=float(cut.mean()), at=at)
-        story = Story(Kind.PROGRAM, told)
-        yield Row(replace(policy, low=low, high=high), trial, (story,))
-
-
-def _cut(policy: Policy, run: Commanded, j: int, sign: float) -> Any:
-    """Return the steps (T,) at which an input was cut at its largest or smallest value; or None."""
-    u, wanted, size = sign * run.sent[:, j], sign * run.asked[:, j], float(run.size[j])
-    end = float(u.max(initial=-np.inf))
-    limit = float(policy.high[j] if sign > 0 else -policy.low[j])
-    at, more = u >= end - FINE**2 * size, wanted > end + SLIGHT * size
-    enough = at.sum() >= max(STEPS_TO_JUDGE, 0.05 * len(u)) and end < limit - SLIGHT * size
-    both = float((at & more).sum())
-    return at if enough and both >= 0.8 * max(at.sum(), more.sum()) else None
+        where = tuple(f"{n} = {number(v)}" for n, some in cuts.items() for v in some)
+        told = found("run.clipped", *cuts, ran=own.id, share=float(cut.mean()), at=where)
+        clipped = replace(policy, low=ends[0], high=ends[1])
+        yield Row(clipped, trial, (Story(Kind.PROGRAM, told),))
 
 
 def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:

@@ -219,31 +219,6 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
     assert any("c0002" in note and "set aside" in note for note in again.notes)
 
 
-LOGGED = (
-    CONFIG
-    + """
-[log.state.x]
-path = "/csv.x"
-[log.state.v]
-path = "/csv.v"
-[log.input.force]
-path = "/csv.force"
-"""
-)
-
-
-def recorded(path, trial, before, rng):
-    """A run as a table at 100 Hz that begins earlier: the robot rests and is sent zeros."""
-    t = np.arange(round((before + 2.5) * 100)) / 100
-    run = np.clip(t - before, 0, 2)
-    x = [np.interp(run, 0.05 * np.arange(41), column) for column in trial.states.T]
-    step = np.clip(np.floor((t - before) / 0.05 + 1e-6).astype(int), -1, 40)
-    force = np.concatenate([[0.0], trial.inputs[:, 0], [0.0]])[step + 1]
-    noisy = np.column_stack(x) + rng.normal(0, 0.001, (len(t), 2))
-    rows = np.column_stack([1000 + t, noisy, force])
-    np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
-
-
 def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
     """Two copies of a task with other weights: their first candidates send nearly the same."""
     here, there = (
