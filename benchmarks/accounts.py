@@ -352,144 +352,123 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     model, dt = robot.model, robot.dt
     units = {**model.states, **model.inputs}
 
-    def drawn(*some: str) -> str | None:
-        names = [n for n in model.states if units[n] in some]
-        return str(rng.choice(names)) if names else None
+    def some_of(*wanted: str, draw: bool = False) -> list[str]:
+        names = [n for n in model.states if units[n] in wanted]
+        return [str(rng.choice(names))] if draw and names else names
 
-    def one(*names: str) -> tuple[frozenset[str], ...]:
-        return (frozenset(names),)
-
-    def times(names: Sequence[str], by: float, some: list[Trial] = trials) -> list[Trial]:
-        def change(c: dict[str, Array]) -> None:
-            for n in names:
-                c[n] *= by
-
-        return _set(some, change)
+    def times(names: Sequence[str], by: float) -> list[Trial]:
+        return _set(trials, lambda c: c.update({n: by * c[n] for n in names}))
 
     def shifted(names: Sequence[str], steps: float) -> list[Trial]:
+        def moved(x: Array) -> Array:
+            at = np.arange(len(x))
+            return np.interp(at - steps, at, x)
+
+        return _set(trials, lambda c: c.update({n: moved(c[n]) for n in names}))
+
+    def exchanged(*pairs: tuple[str, str]) -> list[Trial]:
         def change(c: dict[str, Array]) -> None:
-            for n in names:
-                at = np.arange(len(c[n]))
-                c[n] = np.interp(at - steps, at, c[n])
+            for a, b in pairs:
+                k = min(len(c[a]), len(c[b]))
+                c[a], c[b] = (np.concatenate([c[y][:k], c[x][k:]]) for x, y in ((a, b), (b, a)))
 
         return _set(trials, change)
 
-    def exchanged(a: str, b: str) -> Callable[[dict[str, Array]], None]:
-        def change(c: dict[str, Array]) -> None:
-            length = min(len(c[a]), len(c[b]))
-            c[a], c[b] = (
-                np.concatenate([c[y][:length], c[x][length:]]) for x, y in ((a, b), (b, a))
-            )
-
-        return change
+    def fault(name: str, kind: str, names: Sequence[str], changed: list[Trial]) -> Fault:
+        return Fault(name, kind, (frozenset(names),), changed)
 
     yield Fault("sound", "none", (), trials)
-    # units
-    angle, rate, length, speed = drawn("rad"), drawn("rad/s"), drawn("m"), drawn("m/s")
-    turning = [n for n in model.states if units[n] in ("rad", "rad/s")]
-    lengths = [n for n in model.states if units[n] == "m"]
-    speeds = [n for n in model.states if units[n] == "m/s"]
-    yield Fault("angle: degrees", "unit", one(str(angle)), times([str(angle)], DEGREES))
-    yield Fault("angles: degrees", "unit", one(*turning), times(turning, DEGREES))
-    first = [*times([str(angle)], DEGREES, trials[:1]), *trials[1:]]
-    yield Fault("degrees once", "unit", one(str(angle)), first)
-    if rate:
-        yield Fault("rate: degrees", "unit", one(rate), times([rate], DEGREES))
-        yield Fault("rate: rpm", "unit", one(rate), times([rate], RPM))
-        yield Fault("rate: sign", "sign", one(rate), times([rate], -1.0))
-        scaled = float(rng.choice([0.75, 1.3]))
-        yield Fault("rate: scale", "scale", one(rate), times([rate], scaled))
-        noise = max(robot.noise)
-        dead = _set(trials, lambda c: c.update({rate: noise * rng.normal(size=len(c[rate]))}))
-        yield Fault("rate: noise", "dead", one(rate), dead)
-        none = _set(trials, lambda c: c.update({rate: np.full(len(c[rate]), 0.0)}))
-        yield Fault("rate: zero", "dead", one(rate), none)
-        first = [dead[0], *trials[1:]]
-        yield Fault("noise once", "dead", one(rate), first)
-        late = float(rng.uniform(0.06, 0.15)) / dt
-        yield Fault("late rate", "late", one(rate), shifted([rate], late))
-    if length:
-        yield Fault("position: mm", "unit", one(length), times([length], 1e3))
-        yield Fault("positions: mm", "unit", one(*lengths), times(lengths, 1e3))
-        feet = (frozenset(lengths),)
-        yield Fault("positions: feet", "unit", feet, times(lengths, 3.28084))
-        yield Fault(
-            "positions exchanged",
-            "exchange",
-            one(*lengths[:2]),
-            _set(trials, exchanged(*lengths[:2])),
-        )
-        yield Fault("position: sign", "sign", one(length), times([length], -1.0))
-        late = float(rng.uniform(0.12, 0.25)) / dt
-        yield Fault("late positions", "late", one(*lengths), shifted(lengths, late))
-    if speed:
-        yield Fault("speeds: km/h", "unit", one(*speeds), times(speeds, 3.6))
-        yield Fault("speeds: knots", "unit", one(*speeds), times(speeds, 1.943844))
-        yield Fault("lengths: mm", "unit", one(*lengths, *speeds), times([*lengths, *speeds], 1e3))
-    if length and angle and "heading" in model.roles:
-        yield Fault(
-            "heading exchanged",
-            "exchange",
-            one(length, angle),
-            _set(trials, exchanged(length, angle)),
-        )
-        turn = float(rng.choice([np.pi / 2, -0.7, 1.2]))
-        off = _set(trials, lambda c: c.update({angle: c[angle] + turn}))
-        yield Fault("heading: offset", "offset", one(angle), off)
-        others = {n for n in model.states if n == "r"}
-        compass = _set(trials, lambda c: c.update({angle: np.pi / 2 - c[angle]}))
-        yield Fault("compass heading", "sign", one(angle), compass)
-        both = _set(compass, lambda c: c.update({n: -c[n] for n in others}))
-        if others:
-            yield Fault("compass, gyro", "sign", one(angle, *others), both)
-        yield Fault("heading: sign", "sign", one(angle), times([angle], -1.0))
-    pairs = [
-        (q, w)
-        for q, w in (("q1", "w1"), ("th", "w"), ("x", "vx"), ("psi", "r"))
-        if {q, w} <= {*units}
-    ]
-    for q, w in pairs[:1]:
-        yield Fault("velocity exchanged", "exchange", one(q, w), _set(trials, exchanged(q, w)))
-    for q, w in [one for one in pairs if one[0] in ("q1", "th")][:1]:
-        yield Fault("joint: sign", "sign", one(q, w), times([q, w], -1.0))
-    if "q2" in units:
-        swap = _set(_set(trials, exchanged("q1", "q2")), exchanged("w1", "w2"))
-        both = (frozenset({"q1", "q2", "w1", "w2"}), frozenset({"tau1", "tau2"}))
-        yield Fault("joints exchanged", "exchange", both, swap)
-    # commands
+    drawn = [some_of(unit, draw=True) for unit in ("rad", "rad/s", "m", "m/s")]
+    angle, rate, length, speed = drawn
+    turning, lengths, speeds = some_of("rad", "rad/s"), some_of("m"), some_of("m/s")
     a, b = model.input_names[:2]
-    yield Fault("commands exchanged", "exchange", one(a, b), _set(trials, exchanged(a, b)))
-    factors = {"rad": DEGREES, "%": 0.01, "N": 1000.0, "N m": 1000.0, "1": 100.0}
     same = [n for n in model.inputs if units[n] == units[b]]
-    yield Fault("commands: unit", "unit", one(*same), times(same, factors[units[b]]))
-    first = [*times([b], -1.0, trials[:1]), *trials[1:]]
+    factors = {"rad": DEGREES, "%": 0.01, "N": 1000.0, "N m": 1000.0, "1": 100.0}
+    heading = angle if "heading" in model.roles else []
+    joints = [(q, w) for q, w in (("q1", "w1"), ("th", "w")) if {q, w} <= {*units}]
+    for name, names, by in (
+        ("angle: degrees", angle, DEGREES),
+        ("angles: degrees", turning, DEGREES),
+        ("rate: degrees", rate, DEGREES),
+        ("rate: rpm", rate, RPM),
+        ("rate: sign", rate, -1.0),
+        ("position: mm", length, 1e3),
+        ("positions: mm", length and lengths, 1e3),
+        ("positions: feet", length and lengths, 3.28084),
+        ("position: sign", length, -1.0),
+        ("speeds: km/h", speeds, 3.6),
+        ("speeds: knots", speeds, 1.943844),
+        ("lengths: mm", speed and [*lengths, *speeds], 1e3),
+        ("heading: sign", length and heading, -1.0),
+        ("joint: sign", [n for pair in joints[:1] for n in pair], -1.0),
+        ("commands: unit", same, factors[units[b]]),
+    ):
+        if names:
+            yield fault(name, "sign" if by == -1.0 else "unit", names, times(names, by))
+    yield fault("degrees once", "unit", angle, [*times(angle, DEGREES)[:1], *trials[1:]])
     if not robot.held:
-        yield Fault("reversed once", "sign", one(b), first)
+        yield fault("reversed once", "sign", [b], [*times([b], -1.0)[:1], *trials[1:]])
+    # a rate
+    if rate:
+        (r,), noise = rate, max(robot.noise)
+        yield fault("rate: scale", "scale", rate, times(rate, float(rng.choice([0.75, 1.3]))))
+        dead = _set(trials, lambda c: c.update({r: noise * rng.normal(size=len(c[r]))}))
+        yield fault("rate: noise", "dead", rate, dead)
+        none = _set(trials, lambda c: c.update({r: np.full(len(c[r]), 0.0)}))
+        yield fault("rate: zero", "dead", rate, none)
+        yield fault("noise once", "dead", rate, [dead[0], *trials[1:]])
+        yield fault("late rate", "late", rate, shifted(rate, float(rng.uniform(0.06, 0.15)) / dt))
+    # places
+    if length:
+        pair = (lengths[0], lengths[1])
+        yield fault("positions exchanged", "exchange", pair, exchanged(pair))
+        late = float(rng.uniform(0.12, 0.25)) / dt
+        yield fault("late positions", "late", lengths, shifted(lengths, late))
+    if length and heading:
+        (psi,), pair = heading, (length[0], heading[0])
+        yield fault("heading exchanged", "exchange", pair, exchanged(pair))
+        turn = float(rng.choice([np.pi / 2, -0.7, 1.2]))
+        off = _set(trials, lambda c: c.update({psi: c[psi] + turn}))
+        yield fault("heading: offset", "offset", [psi], off)
+        compass = _set(trials, lambda c: c.update({psi: np.pi / 2 - c[psi]}))
+        yield fault("compass heading", "sign", [psi], compass)
+        if "r" in units:
+            both = _set(compass, lambda c: c.update({"r": -c["r"]}))
+            yield fault("compass, gyro", "sign", [psi, "r"], both)
+    others = [("x", "vx"), ("psi", "r")]
+    for pair in [*joints, *(one for one in others if {*one} <= {*units})][:1]:
+        yield fault("velocity exchanged", "exchange", pair, exchanged(pair))
+    if "q2" in units:
+        both = (frozenset({"q1", "q2", "w1", "w2"}), frozenset({"tau1", "tau2"}))
+        swapped = exchanged(("q1", "q2"), ("w1", "w2"))
+        yield Fault("joints exchanged", "exchange", both, swapped)
+    # commands
+    yield fault("commands exchanged", "exchange", (a, b), exchanged((a, b)))
     early = max(2, round(0.25 / dt))
     moved = [
         replace(t, states=t.states[early:], inputs=t.inputs[: t.steps - early]) for t in trials
     ]
-    yield Fault("states early", "clock", one(*model.states), moved)
+    yield fault("states early", "clock", model.state_names, moved)
     # samples
     name = str(rng.choice(model.state_names))
     every = int(rng.integers(3, 6))
     hold = _set(
         trials, lambda c: c.update({name: np.repeat(c[name][::every], every)[: len(c[name])]})
     )
-    yield Fault("held values", "held", one(name), hold)
+    yield fault("held values", "held", [name], hold)
 
     def sticks(c: dict[str, Array]) -> None:
         for at in range(30, len(c[name]) - 30, 60):
             c[name][at : at + 20] = c[name][at]
 
-    yield Fault("stuck", "stuck", one(name), _set(trials, sticks))
+    yield fault("stuck", "stuck", [name], _set(trials, sticks))
 
     gone = 40 * float(np.std(trials[0].states[:, model.state_names.index(name)])) + 5
 
     def drops(c: dict[str, Array]) -> None:
         c[name][10::31] = gone
 
-    yield Fault("drop-outs", "dropout", one(name), _set(trials, drops))
+    yield fault("drop-outs", "dropout", [name], _set(trials, drops))
 
 
 # --- candidates -----------------------------------------------------------------------------------
