@@ -196,7 +196,7 @@ class _ByRows:
             i = next(row.i for row in self.rows if j in row.by and row in self.each[first])
             moved = (i, float(np.nanmean(x[:, j])), float(np.nanmax(x[:, i]) - np.nanmin(x[:, i])))
         whole, others = len(some) == len(self.trials), () if self.sound else best.others
-        return Told(account, tuple(some), best.gain, others, whole, moved=moved)
+        return Told(account, tuple(sorted(some)), best.gain, others, whole, moved=moved)
 
     def _table(self) -> list[Account]:
         """Return the accounts of these trials, of columns that rows relate as well."""
