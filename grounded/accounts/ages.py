@@ -48,7 +48,6 @@ OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
 SAMPLES_PER_WEIGHT = 10  # samples per weight
-FORESEEN = 0.1  # weight of the second later difference above which it is no causal filter
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
 UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
@@ -335,7 +334,7 @@ def _weighed(
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
     explained = left < min(UNEXPLAINED * float(np.sqrt(w @ w / count)), CARRIED * passed)
     gain = float(weights.sum())
-    if rank < length or not explained or abs(gain - 1) > OFF or abs(weights[0]) > FORESEEN:
+    if rank < length or not explained or abs(gain - 1) > OFF:
         return None
     covariance = np.linalg.inv(a.T @ a) * left**2
     ages = (np.arange(length) - LATER + 0.5) * dt

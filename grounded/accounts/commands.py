@@ -43,7 +43,6 @@ EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift trie
 STARTS = 120  # samples to predict from
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
 SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
-EVEN = 0.5  # of an input's effect: predictions that bend more are left out
 OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
 
 
@@ -222,7 +221,7 @@ def _scores(ahead: Ahead) -> tuple[Array, Array]:
         by = off[:1] - off[1 : m + 1]  # what each input does (m, N, k)
         bent = off[:1] - off[m + 1 :] - 2 * by
         size = np.square(by / ahead.least).sum(axis=(0, 2))
-        even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= EVEN**2 * size
+        even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= HALF_ERROR**2 * size
         even &= np.isfinite(off).all(axis=(0, 2))
         if even.sum() < FEWEST_SAMPLES:
             continue

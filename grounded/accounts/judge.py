@@ -17,6 +17,7 @@ import numpy as np
 
 from grounded.accounts.kinematics import Gap, Row, away, gaps, kinematic_rows, turned
 from grounded.accounts.motion import (
+    FLOOR,
     HALF_ERROR,
     HINT,
     LIKE,
@@ -35,10 +36,8 @@ from grounded.trial import Trial
 
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 BETTER = 3.0  # factor by which its share must fall to be mended
-ROUNDING = 0.01  # of a row's motion: smaller shares count as this
 OF_A_UNIT = 0.018  # tolerance of a unit's ratio, of the logarithm of its factor
 TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
-NEAR_NATS = 3 * MARGIN  # [nats] within which accounts of rows are compared by the motion
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
@@ -254,7 +253,7 @@ class _ByRows:
             return None
         # accounts that mend the same rows are told apart by the motion
         least = min(cost.values())
-        near = [account for account in cost if cost[account] < least + NEAR_NATS]
+        near = [account for account in cost if cost[account] < least + 3 * MARGIN]
         if len(near) > 1 and "dead" not in {one.kind for one in near}:
             ahead = horizon_of(trials[0], self.shown)
             for account in near:
@@ -276,7 +275,7 @@ class _ByRows:
         if self.usual is None or account.kind in ("pace", "dead"):
             return 0.0
         size = _spread(mended.states)[some]
-        return float(np.minimum(np.abs(np.log(size / self.usual[some])), NEAR_NATS).sum())
+        return float(np.minimum(np.abs(np.log(size / self.usual[some])), 3 * MARGIN).sum())
 
 
 def _spread(x: Array, about: float | None = None) -> Array:
@@ -289,7 +288,7 @@ def _spread(x: Array, about: float | None = None) -> Array:
 
 
 def _nats(gap: Gap) -> float:
-    return float(np.log(max(gap.share, ROUNDING)))
+    return float(np.log(max(gap.share, FLOOR)))
 
 
 def _agrees(before: Gap, after: Gap) -> bool:

@@ -34,8 +34,8 @@ from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.workspace.intake.opening.acted_on import ActedOn, acted_on
 from grounded_trials.workspace.intake.opening.run_start import Recording, Start
 
+LOOSE = 0.1  # uncertainty of a start, in steps, above which it is another, or is told
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
-PUNCTUAL = 0.1  # of a step: by more, a first command with a stamp of its own is late
 ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
@@ -142,7 +142,7 @@ def elsewhere(log: Recording, start: Start, policy: Policy, *, why: bool) -> boo
         return True
     off = abs(start.seconds - log.first)
     if not start.opens_alike or off <= ALIGNED * log.interval:
-        return start.alike and off > PUNCTUAL * log.dt and not log.late.any()
+        return start.alike and off > LOOSE * log.dt and not log.late.any()
     return why or start.exact or start.apart < CLEARLY * log.apart_at(policy, log.first)
 
 

@@ -54,6 +54,7 @@ from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 from grounded_trials.workspace.intake.recognising.look import (
     ALIGNED,
+    LOOSE,
     behind,
     elsewhere,
     fall_in,
@@ -68,7 +69,6 @@ WHOLE = 0.9  # share of a run that a log must last to be one, or else the error 
 EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 ENDED = ("stopped", "converged")  # phases of a search
 SHORTER = 1.0  # [nats] that a fall costs
-LOOSE = 0.1  # uncertainty of a start, in steps, above which a warning is given
 
 
 def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
