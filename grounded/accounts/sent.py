@@ -12,13 +12,12 @@ another's place is far from it (`far`).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 
-from grounded.frozen import Array, median
+from grounded.frozen import Array, median, white_noise
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
 from grounded.trial import Trial
@@ -86,7 +85,8 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
     width = policy.high - policy.low
     earlier = [states_ago(trial.states[:T], back, policy.angles) for back in BACK]
-    states = np.stack([*earlier, _noisy(policy, trial.states[:T])])
+    noise = np.random.default_rng(0).normal(size=(T, trial.states.shape[1]))  # once more
+    states = np.stack([*earlier, trial.states[:T] + noise * white_noise(trial.states[:T])])
     *_, with_noise = asked = policy.commands(states, policy.past if past is None else past)
     free = asked[:-1]
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
@@ -243,21 +243,6 @@ def states_ago(states: Array, steps: float, angles: tuple[bool, ...]) -> Array:
     now, before = states[np.clip(at, 0, last)], states[np.clip(at - 1, 0, last)]
     earlier: Array = now - part * z_difference(now, before, angles)
     return earlier
-
-
-def _noisy(policy: Policy, states: Array) -> Array:
-    """Return the states with once more the noise that they seem to have, (T, n)."""
-    change = second_differences(states, policy.angles)
-    power = (change**2).mean(axis=0) / 6  # of white noise
-    noise = np.random.default_rng(0).normal(size=states.shape) * np.sqrt(power)
-    return np.asarray(states + noise)
-
-
-def second_differences(states: Array, angles: Sequence[bool] | Array) -> Array:
-    """Return second differences of states (T, n), (T - 2, n), which consist mostly of noise."""
-    turns = tuple(map(bool, angles))
-    change: Array = np.diff(z_difference(states[1:], states[:-1], turns), axis=0)
-    return change
 
 
 # --- beside its prediction ------------------------------------------------------------------------

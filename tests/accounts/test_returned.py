@@ -1,0 +1,145 @@
+"""How the log of a run came about: columns in other units, and what a program passed."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+import grounded as gr
+from grounded.accounts.returned import Kind, multiplied, stories, suspicion, unit_by_factor
+from grounded.accounts.sent import apart, follows, latest, like_predicted
+from grounded.onboard import Runner
+from grounded.search.ask_tell import Search
+from grounded.trial import Trial
+from small_tasks import rover_task
+
+
+def columns(task, candidate, trial):
+    """The columns of a log that are in another unit, and the factor to correct them."""
+    some = stories(task, candidate, trial, follows(candidate.policy, trial, latest(task)))
+    return next(((one.names, one.by) for one in some if one.kind is Kind.UNIT), ((), 1.0))
+
+
+MODEL = gr.Model(
+    states={"x": "m", "v": "m/s"},
+    inputs={"force": "N"},
+    params={"mass": gr.Param(1.0, "kg", 0.5, 2.0)},
+    derivative=lambda s, a, p: {"x": s.v, "v": a.force / p.mass},
+)
+T = np.linspace(0.0, 1.0, 51)
+TASK = gr.Task(
+    model=MODEL,
+    dt=0.02,
+    target=np.column_stack([T**3 * (10 - 15 * T + 6 * T**2), np.full(51, np.nan)]),
+    reward=gr.Reward(state=[10.0, 0.0], terminal=[50.0, 0.0], input=[0.001], input_change=[0.01]),
+    start=np.zeros(2),
+    past=np.zeros(1),
+    low=np.array([-15.0]),
+    high=np.array([15.0]),
+)
+
+
+def robot(candidate, units=1.0, noise=0.0, late=0):
+    """A run of a heavier cart with friction that feeds back metres and logs other units."""
+    runner, states, inputs = Runner(candidate.policy), [np.zeros(2)], []
+    shaken = np.random.default_rng(0).normal(size=(60, 2)) * noise
+    for step in range(candidate.policy.horizon):
+        seen = states[max(0, step - late)] + shaken[step]
+        sent = runner.action(step * 0.02, seen)
+        x, v = states[-1]
+        pull = (sent[0] - 0.4 * v - 0.3 * np.tanh(v / 0.01)) / 1.3
+        states.append(np.array([x + 0.02 * v, v + 0.02 * pull]))
+        inputs.append(sent)
+    return gr.Trial(units * np.array(states), np.array(inputs), 0.02, ("x", "v"), ("force",))
+
+
+@pytest.mark.parametrize(("units", "named"), [(1e3, "mm"), (100.0, "cm"), (1e-3, "km")])
+def test_lengths_in_another_unit_are_found_though_all_columns_agree(units, named):
+    candidate = gr.Search(TASK).ask()
+    names, by = columns(TASK, candidate, robot(candidate, units))
+    assert names == ("x", "v")
+    assert by == pytest.approx(1 / units)
+    assert unit_by_factor(MODEL, names, by) == named
+    with pytest.raises(gr.GroundedError, match=f"are in {named}"):
+        gr.learn(TASK, lambda c: robot(c, units))
+    assert gr.learn(
+        TASK, lambda c: robot(c, units), gr.SearchOptions(max_trials=1), check=False
+    ).trials
+
+
+def test_tell_warns_of_the_first_trial_only_and_keeps_it():
+    search = gr.Search(TASK)
+    with pytest.warns(UserWarning, match="x and v are in mm"):
+        search.tell(robot(search.ask(), 1e3))
+    assert len(search.trials) == 1
+    sound = gr.Search(TASK)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        sound.tell(robot(sound.ask()))
+        sound.tell(robot(sound.ask()))
+
+
+@pytest.fixture(scope="module")
+def waiting():
+    task = rover_task()
+    return task, Search(task).ask()
+
+
+def driven(task, made, states=lambda x: x, times=lambda t: t, seed=0):
+    """Run a candidate in its model, by a program that passes changed states and times."""
+    runner, rng = Runner(made.policy), np.random.default_rng(seed)
+    x, rows, sent = task.start.copy(), [], []
+    for k in range(task.horizon):
+        seen = x + rng.normal(0, 0.002, len(x))
+        rows.append(seen)
+        u = runner.action(times(k * task.dt), states(seen))
+        sent.append(u)
+        x = task.model.system.step(x[None], 0.9 * u[None], task.model.values, task.dt)[0]
+    names = task.model.state_names, task.model.input_names
+    return Trial(np.array([*rows, x]), np.array(sent), task.dt, *names, candidate=made.id)
+
+
+WAYS = {
+    "degrees": ({"states": lambda x: x * [1, 1, 180 / np.pi]}, {"unit": "degrees"}),
+    "mm": ({"states": lambda x: x * [1e3, 1e3, 1]}, {"unit": "mm"}),
+    "cm": ({"states": lambda x: x * [100, 100, 1]}, {"unit": "cm", "states": ("x", "y")}),
+    "compass": ({"states": lambda x: x * [1, 1, -1]}, {"states": ("psi",), "times": -1.0}),
+    "order": ({"states": lambda x: x[[1, 0, 2]]}, {"passed": ("y", "x", "psi")}),
+    "last first": ({"states": lambda x: x[[2, 0, 1]]}, {"passed": ("psi", "x", "y")}),
+    "ms": ({"times": lambda t: 1e3 * t}, {"time": "ms"}),
+    "minutes": ({"times": lambda t: t / 60}, {"time": "minutes"}),
+    "clock": ({"times": lambda t: 1.7e9 + t}, {"time": "a clock"}),
+    "nothing": ({"states": lambda x: x * np.nan}, {"ran": "c0001"}),
+    "zero": ({"times": lambda t: 0 * t}, {"time": "no unit: it stays 0"}),
+}
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_what_the_program_passed_is_named(waiting, way):
+    task, made = waiting
+    wrong, named = WAYS[way]
+    trial = driven(task, made, **wrong)
+    found = suspicion(task, trial, made, [made])
+    assert found.why.code == ("run.unfed" if way == "nothing" else "run.passed")
+    assert {key: found.why.facts[key] for key in named} == named
+
+
+def test_a_run_that_sent_commands_is_not_told_to_be_past_its_end(waiting):
+    task, made = waiting
+    trial = driven(task, made, times=lambda t: 1.7e9 + t)
+    plain = follows(made.policy, trial, latest(task))
+    for acts in (False, True):
+        some = stories(task, made, trial, plain, acts=acts)
+        told = [one.finding.facts["time"] for one in some if one.kind is Kind.PROGRAM]
+        assert told[:1] == ["a clock"] * (not acts)
+
+
+@pytest.mark.parametrize("by", [1.0, 1e3, 1e-3, 180 / np.pi, -1.0])
+def test_a_column_farther_from_the_prediction_is_told_whatever_its_size(waiting, by):
+    task, made = waiting
+    run = driven(task, made)
+    wrong = multiplied(run, ["x"], by)
+    assert (apart(made, wrong) > apart(made, run) + 1) == (by != 1)
+    names, factor = columns(task, made, wrong)
+    assert like_predicted(made, run) and names == ("x",) * (by != 1)
+    assert factor * by == pytest.approx(1.0, rel=0.01)
