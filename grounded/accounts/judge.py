@@ -36,12 +36,12 @@ from grounded.trial import Trial
 
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 BETTER = 3.0  # factor by which its share must fall to be mended
-OF_A_UNIT = 0.018  # tolerance of a unit's ratio, of the logarithm of its factor
+OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
 TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
-UNLIKE_OTHERS = 20.0  # times as large as in other trials: a trial to be examined
+GROSS = 20.0  # a gross factor; of a trial that is as much larger than others: it is examined
 
 
 @dataclass(frozen=True)
@@ -300,8 +300,9 @@ def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
     """Check whether all rows together are right in size, where an account names a unit."""
     power = sum(gap.power for gap in after.values())
     ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
-    off, size = abs(np.log(max(ratio, 1e-9))), abs(np.log(abs(account.factor)))
-    return account.kind != "unit" or bool(off < OF_A_UNIT * size)
+    gross = abs(np.log(abs(account.factor))) > np.log(GROSS)
+    off = abs(np.log(max(ratio, 1e-9)))
+    return account.kind != "unit" or bool(off < (OF_GROSS if gross else OF_A_UNIT))
 
 
 # --- by motion ------------------------------------------------------------------------------------
@@ -345,7 +346,7 @@ def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
     size = np.array([_spread(t.states[:, list(shown)]) for t in trials])
     apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
-    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(UNLIKE_OTHERS))[:TRIALS]})
+    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(GROSS))[:TRIALS]})
 
 
 class _Seen:
