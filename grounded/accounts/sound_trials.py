@@ -33,6 +33,7 @@ from grounded.result import per_second
 from grounded.task import Task
 from grounded.trial import Trial
 
+GROSS = 0.7  # unexplained share of a row's motion that is reported
 ALIKE = 0.1  # relative tolerance within which several scales are one pace of the clock
 
 
@@ -149,7 +150,7 @@ def _unexplained(
     for row in rows:
         some = [one[row] for one in every if row in one]
         gap = Gap(*np.median(some, axis=0)) if some else None
-        if gap is None or min(gap.share, gap.varying) < HALF_ERROR:
+        if gap is None or gap.share < GROSS or gap.varying < HALF_ERROR:
             continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         off = Quantity(float(gap.rate), per_second(model.states[name]))

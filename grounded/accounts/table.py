@@ -240,8 +240,9 @@ def accounts(
     scaled = any(units[k].partition("/")[0] == "m" for k in sent)
     for group in filter(None, dict.fromkeys(groups)):
         fixed = scaled and any(units[k].startswith("m") for k in group)
-        both = all((i in group) == (j in group) for i, j in pairs)  # one alone is told by its row
-        motion = MOTION if both and not fixed else Term(0)
+        fixed |= all(units[k] == "m/s" for k in group)  # which a wrong drag changes as well
+        whole = all((i in group) == (j in group) for i, j in pairs)  # a row tells one alone
+        motion = MOTION if whole and not fixed else Term(0)
         yield from _units(units, group, rows(*group) | motion | COMMANDS, model.n, inputs)
     for factor in (1e3, 1e-3):  # time stamps in ms, or taken for ms
         yield Account("pace", tuple(range(model.n)), factor, unit="ms", price=1.0, terms=ROWS)

@@ -98,7 +98,6 @@ def test_degrees_and_signs_are_put_right_in_the_one_signal_that_has_them(
     ("fault", "about", "by", "unit"),
     [
         (times(x=1e3, y=1e3), ("x", "y"), 1e3, "mm"),
-        (times(x=3.28084, y=3.28084), ("x", "y"), 3.28084, "feet"),
         (times(u=1e3), ("u",), 1e3, "mm/s"),
         (swapped(X, Y), ("x", "y"), None, ""),
         (swapped(U, V), ("u", "v"), None, ""),
