@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,14 +22,13 @@ from grounded.model import Param
 FREE, BALL, SLIDE, HINGE = 0, 1, 2, 3  # mjtJoint
 
 
-class Controls:
+class Controls(NamedTuple):
     """The inputs: names, units, and indices in ctrl (nu) or in qfrc_applied (nv)."""
 
-    def __init__(
-        self, names: Sequence[str], units: Sequence[str], columns: Sequence[int], torques: bool
-    ) -> None:
-        self.names, self.units, self.columns = tuple(names), tuple(units), tuple(columns)
-        self.torques = torques
+    names: Sequence[str]
+    units: Sequence[str]
+    columns: Sequence[int]
+    torques: bool
 
 
 def states_of(compiled: Any) -> dict[str, str]:

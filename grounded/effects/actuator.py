@@ -54,14 +54,14 @@ ONE_SIDED = 0.05  # fraction of an input's peak below which the weaker side coun
 def _threshold(site: Site) -> tuple[Quantity, ...]:
     """Return a threshold, scanned more finely at small values."""
     peak = max(site.scales.peak(name) for name in site.targets)
-    grid = tuple(float(v) for v in np.linspace(0.15, 0.87, 20) ** 2 * peak)
+    grid = np.linspace(0.15, 0.87, 20) ** 2 * peak
     return (Quantity("c", site.unit(site.target), grid, 0.0, peak, places=8),)
 
 
 def _limit(site: Site) -> tuple[Quantity, ...]:
     """Return a limit of an input, scanned from the peak downwards."""
     peak = site.scales.peak(site.target)
-    grid = tuple(float(v) for v in np.linspace(0.95, 0.3, 12) * peak)
+    grid = np.linspace(0.95, 0.3, 12) * peak
     return (Quantity("c", site.unit(site.target), grid, 0.0, 1.5 * peak, start=2 * peak, places=6),)
 
 
@@ -234,7 +234,7 @@ def _lag(site: Site) -> tuple[Quantity, ...]:
 
 def _backlash(site: Site) -> tuple[Quantity, ...]:
     spread = site.scales.spread(site.target)
-    grid = tuple(float(v) for v in np.linspace(0.02, 0.6, 10) * spread)
+    grid = np.linspace(0.02, 0.6, 10) * spread
     return (Quantity("b", site.unit(site.target), grid, 0.0, spread, places=6),)
 
 

@@ -44,7 +44,7 @@ FLAT = 1e-6  # way in units of the bristles' below which they bend in proportion
 def _bending(site: Site) -> tuple[Quantity, ...]:
     tau, w = coupled(site)
     first, stroke = site.scales.turns.get(w, (0.01 * site.scales.peak(w), site.scales.peak(w)))
-    ways = tuple(float(x) for x in np.geomspace(first, max(0.5 * stroke, 2 * first), 6))
+    ways = np.geomspace(first, max(0.5 * stroke, 2 * first), 6)
     c = Quantity("c", site.unit(tau), low=0.0, high=strongest(site))
     unit = site.unit(w).removesuffix("/s")
     return (c, Quantity("x", unit, ways, 0.3 * first, stroke, places=4))
@@ -96,7 +96,7 @@ def _spring(site: Site, driven: float) -> tuple[Quantity, ...]:
     fastest = 1 / (PER_PERIOD * scales.dt)
     slowest = min(PERIODS / scales.duration, 0.5 * fastest)
     count = 1 + int(np.ceil(np.log(fastest / slowest) / np.log(NEXT)))
-    fs = tuple(float(f) for f in np.geomspace(slowest, fastest, count))
+    fs = np.geomspace(slowest, fastest, count)
     f = Quantity("f", "Hz", fs, 0.1 * slowest, 2 * fastest, places=count)
     unit, shares = per_acceleration(site), tuple(part * whole for part in SHARES if driven)
     J = Quantity("J", unit, shares, 1e-3 * whole if driven else 0.0, LARGEST_SHARE * whole)

@@ -66,7 +66,7 @@ class Quantity:
 
     name: str
     unit: str = "1"
-    grid: tuple[float, ...] = ()
+    grid: Sequence[float] | Array = ()
     low: float = -np.inf
     high: float = np.inf
     fixed: bool = False
@@ -76,6 +76,9 @@ class Quantity:
     tuned: bool = False
     absurd: float = np.inf
     known: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "grid", tuple(map(float, self.grid)))
 
 
 @dataclass(frozen=True)
@@ -170,7 +173,7 @@ def speed_limit(site: Site, unit: str) -> tuple[Quantity, ...]:
     """Return a speed limit r, scanned downwards from half the fastest that a step could show."""
     spreads = [site.scales.spread(name) for name in site.targets]
     fastest = max(spreads) / site.scales.dt
-    grid = tuple(float(v) for v in np.geomspace(0.5 * fastest, 0.1 * min(spreads), 12))
+    grid = np.geomspace(0.5 * fastest, 0.1 * min(spreads), 12)
     return (Quantity("r", unit, grid, 0.0, np.inf, start=2 * fastest, places=6),)
 
 
@@ -191,9 +194,9 @@ def scanned_time(
     """
     far, ratio = min(site.scales.slowest, site.scales.duration / 4), grid[-1] / grid[-2]
     more = max(int(np.log(max(far / grid[-1], 1.0)) / np.log(ratio)), 0)
-    whole = (*grid.tolist(), *(grid[-1] * ratio ** np.arange(1, more + 1)).tolist())
+    whole = np.append(grid, grid[-1] * ratio ** np.arange(1, more + 1))
     places *= len(whole) / len(grid)
-    return (Quantity(name, "s", whole, 0.0, reach * whole[-1], places=places),)
+    return (Quantity(name, "s", whole, 0.0, reach * float(whole[-1]), places=places),)
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,7 @@ def _quadratic(site: Site) -> tuple[Quantity, ...]:
 
 def _stiction(site: Site) -> tuple[Quantity, ...]:
     unit, peak = site.unit(site.target), site.scales.peak(site.target)
-    grid = tuple(float(v) for v in np.geomspace(0.05, 4.0, 8) * peak)
+    grid = np.geomspace(0.05, 4.0, 8) * peak
     return (
         Quantity("c", per_second(unit), grid, 0.0, np.inf, places=6),
         Quantity("v_s", unit, fixed=True, start=0.05 * peak),

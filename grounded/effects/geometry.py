@@ -73,7 +73,7 @@ def _patch(site: Site) -> tuple[Quantity, ...]:
     found = [Quantity("c", per_second(site.unit(site.target)))]
     for name, spread in zip(where, spreads, strict=True):
         low = site.scales.low.get(name, -1.0)
-        grid = tuple(float(low + spread * (i + 0.5) / count) for i in range(count))
+        grid = low + spread * (np.arange(count) + 0.5) / count
         known = name in site.scales.low
         ends = (low, low + spread) if known else (-np.inf, np.inf)  # of an adopted patch
         found.append(Quantity(f"{name}0", site.unit(name), grid, *ends, places=count))
@@ -115,7 +115,7 @@ def _grip(site: Site) -> tuple[Quantity, ...]:
     rate = places.role(model, "heading_rate")
     turning = scales.peak(rate[0]) if rate else 4 * turning
     most = max(scales.peak(_speed(site)) * turning, 1e-3)
-    grid = tuple(float(v) for v in np.geomspace(2.0, 0.2, 10) * most)
+    grid = np.geomspace(2.0, 0.2, 10) * most
     return (Quantity("a", "m/s^2", grid, 0.0, np.inf, start=4 * most, places=6),)
 
 

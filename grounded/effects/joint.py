@@ -165,8 +165,7 @@ def _load(w: Any, free: Any, gain: Any, u: Any, c: Any, dt: Any, parts: int = PA
 
 def _loaded(site: Site) -> tuple[Quantity, ...]:
     constant, viscous, constant_width = _friction(site)
-    share = tuple(float(k) for k in np.geomspace(0.02, 0.6, 6))
-    k = Quantity("k", "1", share, 0.02, 0.9, places=4)
+    k = Quantity("k", "1", np.geomspace(0.02, 0.6, 6), 0.02, 0.9, places=4)
     return (constant, viscous, k, constant_width)
 
 

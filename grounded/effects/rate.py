@@ -61,8 +61,8 @@ def _periodic(site: Site) -> tuple[Quantity, ...]:
     highest = max(min(0.2 / scales.dt, 5.0), lowest)
     bins = max((highest - lowest) * scales.duration, 1.0)
     count = int(min(max(2 * bins, 4), 40))
-    grid = tuple(float(2 * np.pi * f) for f in np.linspace(lowest, highest, count))
-    slowest = grid[0] if scales.high else 0.0
+    grid = 2 * np.pi * np.linspace(lowest, highest, count)
+    slowest = float(grid[0]) if scales.high else 0.0
     fastest = 2 * np.pi * max(0.45 / scales.dt, lowest)
     unit = per_second(site.unit(site.target))
     omega = Quantity("omega", "rad/s", grid, slowest, fastest, places=bins)
