@@ -187,50 +187,44 @@ def _numbers(records: Records, rng: random.Random) -> None:
         records[i] = (opcode, body[:at] + part + body[at + size :])
 
 
-def _again(records: Records, rng: random.Random) -> None:
-    records.insert(rng.randrange(len(records) + 1), rng.choice(records))
-
-
-def _without(records: Records, rng: random.Random) -> None:
-    del records[rng.randrange(len(records))]
+def _place(records: Records, rng: random.Random) -> int:
+    return rng.randrange(len(records))
 
 
 def _swapped(records: Records, rng: random.Random) -> None:
-    i, j = rng.randrange(len(records)), rng.randrange(len(records))
+    i, j = _place(records, rng), _place(records, rng)
     records[i], records[j] = records[j], records[i]
 
 
-def _shorter(records: Records, rng: random.Random) -> None:
-    i = rng.randrange(len(records))
-    if records[i][0] != 5:  # a message cut after a field is still valid: absent fields are 0
-        records[i] = (records[i][0], records[i][1][: rng.randrange(len(records[i][1]) + 1)])
-
-
-def _longer(records: Records, rng: random.Random) -> None:
-    i = rng.randrange(len(records))
-    if records[i][0] != 5:  # the end of a message has no structure: other numbers there are valid
-        records[i] = (records[i][0], records[i][1] + rng.randbytes(rng.randint(1, 40)))
+def _resized(records: Records, rng: random.Random, longer: bool) -> None:
+    """Cut a record or add to it, but for messages: absent fields are 0, more bytes are no field."""
+    i = _place(records, rng)
+    opcode, body = records[i]
+    if opcode != 5:
+        cut = body[: rng.randrange(len(body) + 1)]
+        records[i] = (opcode, body + rng.randbytes(rng.randint(1, 40)) if longer else cut)
 
 
 def _other_kind(records: Records, rng: random.Random) -> None:
-    i = rng.randrange(len(records))
+    i = _place(records, rng)
     records[i] = (rng.choice((*range(1, 16), 0x80, 0)), records[i][1])
 
 
-def _strange(records: Records, rng: random.Random) -> None:
-    body = rng.randbytes(rng.randint(0, 60))
-    records.insert(rng.randrange(len(records) + 1), (rng.randrange(256), body))
+def _inserted(records: Records, rng: random.Random, record: tuple[int, bytes]) -> None:
+    records.insert(rng.randrange(len(records) + 1), record)
 
 
 _MUTATIONS: dict[str, Callable[[Records, random.Random], None]] = {
     "a number": _numbers,
-    "a record twice": _again,
-    "a record less": _without,
+    "a record twice": lambda records, rng: _inserted(records, rng, rng.choice(records)),
+    "a record less": lambda records, rng: records.__delitem__(_place(records, rng)),
     "two swapped": _swapped,
-    "cut": _shorter,
-    "longer": _longer,
+    "cut": lambda records, rng: _resized(records, rng, longer=False),
+    "longer": lambda records, rng: _resized(records, rng, longer=True),
     "another kind": _other_kind,
-    "a strange record": _strange,
+    "a strange record": lambda records, rng: _inserted(
+        records, rng, (rng.randrange(256), rng.randbytes(rng.randint(0, 60)))
+    ),
 }
 
 
