@@ -67,17 +67,13 @@ NO_INFORMATION = 1e-6  # fraction of a value's information, and of its size, tha
 class Probe:
     """A policy to run, the evidence expected of it [nats], and the next step that runs it.
 
-    `about`: the two effects that it separates, or the value whose `+-` it reduces most.
-    `little`: whether that is too little to be worth a trial. `std`: the standard deviation of that
-    value, in its unit, after a run.
+    `little`: whether that is too little to be worth a trial.
     """
 
     policy: Policy
     expected: float
-    about: tuple[str, ...]
     step: Finding
     little: bool = False
-    std: float = np.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,11 +160,11 @@ def probe(
     pair: dict[str, Any] = {"effect": group[0], "others": group[1]}
     if expected >= NATS:
         step = found("gap.next.probe", *group[:2], by=expected, probe=words, **pair)
-        return Probe(chosen, expected, (group[0], group[1]), step)
+        return Probe(chosen, expected, step)
     claimed = next((name for name in group[:2] if name in diagnosis.effects), None)
     claimed = claimed if most < SEPARABLE_NATS and not diagnosis.contested else None
     step = found("gap.next.no_probe", *group[:2], claimed=claimed, **pair)
-    return Probe(chosen, expected, (group[0], group[1]), step, little=True)
+    return Probe(chosen, expected, step, little=True)
 
 
 def _teaching(
@@ -227,7 +223,7 @@ def _teaching(
     elif not little:
         ends: dict[str, Any] = {"after": Quantity(then, e.unit), "now": Quantity(e.std, e.unit)}
         step = found("gap.next.probe", name, probe=words, value=called, **ends)
-    return Probe(chosen, gain, (name,), step, little, then)
+    return Probe(chosen, gain, step, little)
 
 
 def _misfit(diagnosis: Diagnosis) -> float:

@@ -89,11 +89,11 @@ def test_a_probe_tells_two_explanations_apart():
     assert (best.policy.feedforward >= -1).all()
     assert (best.policy.feedforward <= 1).all()
     alone = probe(task, base, replace(found, indistinguishable=()), trials)
-    assert alone is not None and alone.expected > 0 and len(alone.about) == 1
+    assert alone is not None and alone.expected > 0 and len(alone.step.about) == 1
     assert (np.abs(alone.policy.feedforward) <= 1).all()
     assert not alone.little
     surely = probe(task, base, replace(found, indistinguishable=()), trials * 40)
-    assert surely.little and surely.about == alone.about
+    assert surely.little and surely.step.about == alone.step.about
     none = replace(found, verdict=replace(found.verdict, effects=()), parameters={})
     assert probe(task, base, replace(none, indistinguishable=()), trials) is None
 
