@@ -25,8 +25,8 @@ from grounded.diagnosis.validation.choose import Comparison
 from grounded.diagnosis.validation.decide import Options, decide
 
 CURVES = {
-    (choose, "NATS"): (1.0, 2.0, 3.0, 5.0, 8.0),
-    (choose, "SURE"): (0.5, 1.0, 1.5, 2.0, 3.0),
+    (choose, "PICKED"): (1.0, 3.0, 5.0, 8.0, 12.0),
+    (choose, "ERRORS"): (0.0, 0.5, 1.0, 1.5, 2.0, 3.0),
     (choose, "SHARE"): (0.0, 0.01, 0.02, 0.05),
     (choose, "LEAST"): (0.0, 0.01, 0.03, 0.1),
 }

@@ -42,10 +42,7 @@ class Predicted:
 
     def better(self, other: Predicted) -> int:
         """Return 1 if another model predicts better, -1 if worse, 0 if it can't be decided."""
-        more, less = self.gain(other), other.gain(self)
-        if more.clear != less.clear:
-            return 1 if more.clear else -1
-        return int(more.pays) - int(less.pays)
+        return int(self.gain(other).clear) - int(other.gain(self).clear)
 
     @property
     def by_horizon(self) -> list[tuple[float, Mapping[str, float]]]:

@@ -13,7 +13,7 @@ import numpy as np
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import Identifiable
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
-from grounded.diagnosis.levels import LEAST, NATS
+from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate
@@ -97,7 +97,7 @@ class Fit(Result):
         """Whether held-out trials are predicted worse than before, by as much as matters."""
         if self.gain is None or self.loss is None:
             return False
-        return (self.loss.pays and self.loss.mean > LEAST) or self.gain.ruins
+        return self.loss.clear or self.gain.ruins
 
     @property
     def at_bounds(self) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ Search proposes, this rule claims. Every set of causes that was fitted is an `Op
 and its errors where its values were not fitted (`ruler`, by group of trials). The rule has four
 steps:
 
-    1. A set is *supported* if each of its causes is: with it the set is likelier (NATS nats), and
+    1. A set is *supported* if each of its causes is: with it the set is likelier (PICKED nats), and
        predictions are better by more than their standard error and as much as matters (LEAST, and
        SHARE of what the set gains). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
@@ -18,11 +18,9 @@ A cause is an effect, or the calibration of the model's own parameters. `benchma
 each number's curve.
 
 The gain in predictions is the mean log ratio of rms errors over channels and horizons; its standard
-error is the jackknife's over trials (in a single log, over the runs that it is cut into). Runs
-differ in how much of an effect they contain: if two of eight trials show all of it, the gain is 1.5
-standard errors even without noise. So the short horizons are also compared in pieces of a second,
-where a piece in which the effect does not act adds neither gain nor scatter (`Gain.again`), and
-single channels are looked at, since an effect on one would be lost in the mean over a dozen.
+error is the jackknife's over trials (in a single log, over the runs that it is cut into). Trials are
+few and differ in how much of an effect they contain, so that even a large effect gains little more
+than its standard error: surer predictions are not asked for, and more nats of evidence instead.
 """
 
 from __future__ import annotations
@@ -34,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.levels import LEAST, NATS, SHARE, SURE
+from grounded.diagnosis.levels import ERRORS, LEAST, NATS, PICKED, SHARE, SURE
 from grounded.frozen import Array
 
 
@@ -98,7 +96,7 @@ class Rule:
             return Choice(likeliest, likeliest, 0.0, 0.0)
         by = sorted(self.options, key=self.gained, reverse=True)
         reference = next(option for option in by if not self.unsupported(option))
-        near = [option for option in by if self._as_good(option, reference)]
+        near = [o for o in by if not self.gain(o.errors, reference.errors).pays]
         for size in sorted({len(option.causes) for option in near}):
             small = [o for o in near if len(o.causes) == size and not self.unsupported(o)]
             if small:
@@ -128,15 +126,11 @@ class Rule:
     def _needed(self, option: Option, cause: str) -> bool:
         """Check whether a set is likelier and predicts better with one of its causes."""
         less = self.less(option, cause)
-        if less is None or not option.evidence - less.evidence >= NATS:  # also of no evidence
+        if less is None or not option.evidence - less.evidence >= PICKED:  # also of no evidence
             return False
         more = self.gain(less.errors, option.errors)
         matters = more.mean >= SHARE * max(self.gained(option), 0.0)
         return not self.held_out or (matters and more.pays)
-
-    def _as_good(self, option: Option, best: Option) -> bool:
-        """Check whether predictions of the best set are no better, by the test of a cause."""
-        return not self.gain(option.errors, best.errors).pays
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,8 +155,6 @@ class Gain:
     scatter: float  # its jackknife standard error
     largest: float  # of any channel and horizon
     channels: Array  # (n',) mean over horizons, by shown state
-    scatters: Array  # (n',) standard errors of these
-    again: float  # gain of all pieces but those of the best trial, in scatters of their sum
     whole: tuple[float, float] = (0.0, 0.0)  # gain over whole trials and its standard error
 
     @property
@@ -177,10 +169,11 @@ class Gain:
 
     @property
     def pays(self) -> bool:
-        """Whether predictions are better: clearly, or twice as surely again and again or in one."""
-        one = (self.channels > 2 * SURE * self.scatters) & (self.channels > LEAST)
-        several = self.mean > 0 and (self.again > 2 * SURE or bool(one.any()))
-        return self.clear or (several and self.largest > LEAST)
+        """Whether predictions are better by more than their standard error.
+
+        What one of many trials alone gains is one standard error.
+        """
+        return self.mean > ERRORS * self.scatter and self.largest > LEAST
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,8 +211,6 @@ class Comparison:
             float(jackknife(by.sum(axis=-1) / some)),
             float(whole.max()),
             whole.sum(axis=(0, 1)) / counts,
-            jackknife(by / counts),
-            self._again(before, after),
             (float(whole[-1].sum() / last), float(jackknife(each[-1].sum(axis=-1) / last))),
         )
 
@@ -229,20 +220,6 @@ class Comparison:
         for k, one in enumerate(values[..., self.shown]):
             np.add.at(found[k], self.unit, one)
         return found
-
-    def _again(self, before: Errors, after: Errors) -> float:
-        """Return the gain of the pieces without the best unit, in scatters of their sum.
-
-        Each is damped by the mean error, so that none dominates.
-        """
-        a, b, n = (e[:-1][..., self.shown] for e in (before.total, after.total, before.count))
-        count = np.maximum(n.sum(axis=1, keepdims=True), 1)
-        usual = n * (b.sum(axis=1, keepdims=True) / count + self.matters[:-1, None] ** 2) + 1e-300
-        pieces = (n / count * np.log((a + usual) / (b + usual))).sum(axis=(0, 2))
-        by = np.bincount(self.unit, pieces)
-        rest = pieces[self.unit != int(by.argmax())]
-        scatter = np.sqrt(len(rest) * rest.var()) if len(rest) > 1 else 0.0
-        return float(rest.sum() / scatter) if scatter > 0 else 0.0
 
 
 def jackknife(each: Array) -> Array:
