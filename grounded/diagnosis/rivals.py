@@ -2,7 +2,7 @@
 
 Each model estimates the states along the trials with its own noise, and predicts from there without
 measurements (`ruler`). As no value comes from these trials, all of them are held out. The
-difference is paired by trial (in a single log by run), with its jackknife standard error.
+difference is paired by trial (in a single log by run), with its standard error.
 """
 
 from __future__ import annotations

@@ -194,7 +194,7 @@ def _supported(search: Alone, fits: Sequence[Fitted]) -> Fitted:
     if not ruler.held_out or len(fits) == 1:
         return max(fits, key=search.score)
     best = max(fits, key=ruler.score)
-    near = [f for f in fits if (gain := ruler.gain(f, best)).mean <= gain.scatter]
+    near = [f for f in fits if not ruler.gain(f, best).pays]
     return max(near or [best], key=search.score)
 
 

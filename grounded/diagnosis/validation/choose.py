@@ -17,10 +17,15 @@ steps:
 A cause is an effect, or the calibration of the model's own parameters. `benchmarks/decide.py` draws
 each number's curve.
 
-The gain in predictions is the mean log ratio of rms errors over channels and horizons; its standard
-error is the jackknife's over trials (in a single log, over the runs that it is cut into). Trials are
-few and differ in how much of an effect they contain, so that even a large effect gains little more
-than its standard error: surer predictions are not asked for, and more nats of evidence instead.
+A gain in predictions is the log ratio of errors, paired by trial (in a single log by the runs that
+it is cut into): of each trial the mean over channels and horizons, and of the trials the mean with
+its standard error. Each trial's errors are damped by the mean error,
+
+    log((e1^2 + e^2) / (e2^2 + e^2)),        e^2: mean of both sets over all trials
+
+so that none dominates: where a cause does not act it adds neither gain nor scatter. Trials are few
+and differ in how much of a cause they contain, so that even a large one may gain little more than
+the standard error. So no more is asked of predictions, and more of the evidence.
 """
 
 from __future__ import annotations
@@ -104,12 +109,11 @@ class Rule:
         most = max(option.evidence for option in small)
         tied = [option for option in small if option.evidence > most - NATS]
         chosen = min(tied, key=lambda option: (option.order, -option.evidence))
-        apart = self.gain(chosen.errors, reference.errors)
-        return Choice(chosen, reference, apart.mean, apart.scatter)
+        return Choice(chosen, reference, *self.gain(chosen.errors, reference.errors).paired)
 
     def gained(self, option: Option) -> float:
-        """Return the mean log gain since the outset."""
-        return self.gain(self.outset, option.errors).mean
+        """Return the gain since the outset."""
+        return self.gain(self.outset, option.errors).paired[0]
 
     def unsupported(self, option: Option) -> list[str]:
         """Return the causes of a set that it does not need, or that a guard refuses."""
@@ -129,7 +133,7 @@ class Rule:
         if less is None or not option.evidence - less.evidence >= PICKED:  # also of no evidence
             return False
         more = self.gain(less.errors, option.errors)
-        matters = more.mean >= SHARE * max(self.gained(option), 0.0)
+        matters = more.paired[0] >= SHARE * max(self.gained(option), 0.0)
         return not self.held_out or (matters and more.pays)
 
 
@@ -149,13 +153,14 @@ class Errors:
 
 @dataclass(frozen=True)
 class Gain:
-    """Improvement of one hypothesis over another: mean log ratio of errors, and how sure it is."""
+    """Improvement of one hypothesis over another: log ratio of errors, and how sure it is."""
 
-    mean: float
-    scatter: float  # its jackknife standard error
-    largest: float  # of any channel and horizon
-    channels: Array  # (n',) mean over horizons, by shown state
-    whole: tuple[float, float] = (0.0, 0.0)  # gain over whole trials and its standard error
+    mean: float  # of the rms errors over all trials, mean over channels and horizons
+    largest: float  # the same of any channel and horizon
+    channels: Array  # (n',) the same by shown state, mean over horizons
+    by_channel: Sequence[tuple[float, float]]  # `paired` of each shown state
+    paired: tuple[float, float]  # mean over trials of each trial's damped gain, its standard error
+    whole: tuple[float, float] = (0.0, 0.0)  # the same of whole trials
 
     @property
     def ruins(self) -> bool:
@@ -165,15 +170,15 @@ class Gain:
     @property
     def clear(self) -> bool:
         """Whether predictions are clearly better."""
-        return self.mean > SURE * self.scatter and self.largest > LEAST
+        return self._by(SURE)
 
     @property
     def pays(self) -> bool:
-        """Whether predictions are better by more than their standard error.
+        """Whether predictions are better. What one of many trials gains is one standard error."""
+        return self._by(ERRORS)
 
-        What one of many trials alone gains is one standard error.
-        """
-        return self.mean > ERRORS * self.scatter and self.largest > LEAST
+    def _by(self, errors: float) -> bool:
+        return self.paired[0] > errors * self.paired[1] and self.largest > LEAST
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +188,7 @@ class Comparison:
     Args:
         shown: (n',) states that are compared.
         matters: (K, n') errors below which differences do not matter.
-        unit: (P,) jackknife unit of each piece: its trial, or in a single log its run.
+        unit: (P,) unit of each piece: its trial, or in a single log its run.
     """
 
     shown: Any
@@ -192,26 +197,24 @@ class Comparison:
 
     def __call__(self, before: Errors, after: Errors) -> Gain:
         """Return the gain of one set of errors over another."""
-        a, b = (self._by_unit(errors.total) for errors in (before, after))
-        count = self._by_unit(before.count).sum(axis=1, keepdims=True)
-        seen, least = count > 0, count * self.matters[:, None] ** 2 + 1e-300
+        a, b, count = (self._by_unit(v) for v in (before.total, after.total, before.count))
+        least = self.matters[:, None] ** 2
 
-        def ratio(x: Array, y: Array) -> Array:
-            return np.asarray(np.where(seen, 0.5 * np.log((x + least) / (y + least)), 0.0))
+        # over all trials: by horizon and state
+        sums = [v.sum(axis=1, keepdims=True) for v in (a, b, count)]
+        ratio = 0.5 * log_ratio(sums[0], sums[1], sums[2] * least)
+        seen = np.maximum((sums[2] > 0).sum(axis=(0, 1)), 1)
 
-        def without(x: Array) -> Array:
-            return np.asarray(np.maximum(x.sum(axis=1, keepdims=True) - x, 0.0))
-
-        whole = ratio(a.sum(axis=1, keepdims=True), b.sum(axis=1, keepdims=True))
-        counts = np.maximum(seen.sum(axis=(0, 1)), 1)
-        each, some = ratio(without(a), without(b)), max(int(seen.sum()), 1)
-        by, last = each.sum(axis=0), max(int(seen[-1].sum()), 1)
+        # trial by trial, each with as much of the mean error as it has samples
+        usual = count * ((sums[0] + sums[1]) / 2 / np.maximum(sums[2], 1) + least)
+        each = log_ratio(a, b, usual)
         return Gain(
-            float(whole.sum() / some),
-            float(jackknife(by.sum(axis=-1) / some)),
-            float(whole.max()),
-            whole.sum(axis=(0, 1)) / counts,
-            (float(whole[-1].sum() / last), float(jackknife(each[-1].sum(axis=-1) / last))),
+            float(ratio.sum() / max((sums[2] > 0).sum(), 1)),
+            float(ratio.max()),
+            ratio.sum(axis=(0, 1)) / seen,
+            [over_trials(each[..., [i]], count[..., [i]] > 0) for i in range(each.shape[-1])],
+            over_trials(each, count > 0),
+            over_trials(each[-1:], count[-1:] > 0),
         )
 
     def _by_unit(self, values: Array) -> Array:
@@ -220,6 +223,20 @@ class Comparison:
         for k, one in enumerate(values[..., self.shown]):
             np.add.at(found[k], self.unit, one)
         return found
+
+
+def log_ratio(before: Array, after: Array, beside: Array) -> Array:
+    """Return the logarithm of a ratio of sums of squares with something added to both."""
+    return np.asarray(np.log((before + beside + 1e-300) / (after + beside + 1e-300)))
+
+
+def over_trials(each: Array, seen: Any) -> tuple[float, float]:
+    """Return the mean over trials, and its standard error, of gains (K, U, n') where seen."""
+    known = seen.any(axis=(0, 2))
+    by = (each * seen).sum(axis=(0, 2))[known] / seen.sum(axis=(0, 2))[known]
+    if len(by) < 2:
+        return float(by.sum()), np.inf
+    return float(by.mean()), float(by.std(ddof=1) / np.sqrt(len(by)))
 
 
 def jackknife(each: Array) -> Array:

@@ -164,13 +164,13 @@ def _result(
     way, gain = a.better(b), a.gain(b)
     better = {1: labels[1], -1: labels[0]}.get(way)
     ahead = len(a.by_horizon) - 2 if len(a.by_horizon) > 1 else 0  # the last one before the whole
-    sure = np.abs(gain.channels) > np.maximum(SURE * gain.scatters, LEAST)
+    sure = [abs(more) > max(SURE * error, LEAST) for more, error in gain.by_channel]
     (ahead_s, first), (_, second) = a.by_horizon[ahead], b.by_horizon[ahead]
     where = {
         name: Decided(labels[int(more > 0)] if clear else None, errors=(first[name], second[name]))
         for name, more, clear in zip(first, gain.channels, sure, strict=True)
     }
-    size = Quantity(gain.mean, "1", gain.scatter)
+    size = Quantity(gain.paired[0], "1", gain.paired[1])
     if better:
         worse = labels[0] if way > 0 else labels[1]
         ratio = float(np.exp(abs(gain.mean)))
