@@ -113,7 +113,7 @@ class Rule:
 
     def gained(self, option: Option) -> float:
         """Return the gain since the outset."""
-        return self.gain(self.outset, option.errors).paired[0]
+        return self.gain(self.outset, option.errors).mean
 
     def unsupported(self, option: Option) -> list[str]:
         """Return the causes of a set that it does not need, or that a guard refuses."""
@@ -133,7 +133,7 @@ class Rule:
         if less is None or not option.evidence - less.evidence >= PICKED:  # also of no evidence
             return False
         more = self.gain(less.errors, option.errors)
-        matters = more.paired[0] >= SHARE * max(self.gained(option), 0.0)
+        matters = more.mean >= SHARE * max(self.gained(option), 0.0)
         return not self.held_out or (matters and more.pays)
 
 
