@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any
 
 import click
 
@@ -34,6 +35,7 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
         raise misuse("EFFECT...", "--undo")
     workspace = open_workspace()
     before, file = workspace.base_model.params, workspace.config.file
+    were = _numbers(workspace.config.model.effects)
     if undo:
         done: Adopted | Undone = workspace.undo_adoption()
     else:
@@ -54,6 +56,16 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
     for name, value in values.items():
         text = moved(before[name].value, value, before[name].unit, DIGITS)
         show(field(name, text + ALONE * (name in jointly), "  "))
+    known = _numbers(workspace.config.model.effects)
+    if changed := {name: v for name, v in known.items() if were.get(name, v) != v}:
+        show("[model] effects:")
+    for name, value in changed.items():
+        show(field(name, moved(were[name], value, "", DIGITS), "  "))
     if isinstance(done, Undone):
         show(field("adopted", ", ".join(str(one["name"]) for one in done.effects) or "none"))
     show(f"\n{next_line(done.then)}")
+
+
+def _numbers(effects: Iterable[Mapping[str, Any]]) -> dict[str, float]:
+    """Return the numbers of the effects in [model], as they are called."""
+    return {f"{q} of {e['name']}": v for e in effects for q, v in e.items() if q != "name"}
