@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +14,9 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import LUCK, Difference
 from grounded.search.scatter import (
     NoiseSoFar,
+    Repeats,
+    StartShare,
     by_pieces,
-    explained_by_starts,
     noise_cost,
     noise_missed,
     with_errors,
@@ -46,6 +47,7 @@ def judged(
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
     exact = False  # whether the system has repeated itself to the last bit
+    share = StartShare()
     ids = {c.id for c in candidates}
     known = {trial.id for trial in trials}
     spent = sum(t.candidate in ids for t in trials) >= options.max_trials
@@ -65,7 +67,8 @@ def judged(
             continue
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
         tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone, starts=starts)
-        tried = replace(tried, placed=explained_by_starts((*history, tried)))
+        share.add(tried)
+        tried = replace(tried, placed=share.most)
         better = incumbent is None or tried.utility > incumbent.utility
         if better and not failed:
             tried = replace(tried, accepted=True)
@@ -89,14 +92,16 @@ def judged(
         history.append(tried)
     best_one = incumbent and incumbent.candidate
     noises = NoiseSoFar(trials, task.model.n)
-    later = [[one.id for one in candidates[k:]] for k in range(len(candidates))]
-    pairs = zip(history, later, strict=True)
-    told = with_chances(with_errors([_with_noise(task, t, noises, ids) for t, ids in pairs]))
+    since = [*accumulate((noises.first(c.id) for c in reversed(candidates)), min)][::-1]
+    pairs = zip(history, since, strict=True)
+    whole = [_with_noise(task, tried, noises, first) for tried, first in pairs]
+    pool = Repeats(whole)
+    told = with_chances(with_errors(whole, pool), pool)
     best = next((t for t in told if t.candidate is best_one), None)
     return told, best, iteration
 
 
-def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: Sequence[str]) -> Tried:
+def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: int) -> Tried:
     """Return the candidate with the mean cost of the noise in its logs, and what was promised.
 
     The promise is made with the noise known before its first run, and stays as it is.
@@ -105,7 +110,7 @@ def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: Sequence[st
         task: its reward judges the logs.
         tried: the candidate.
         noises: the noise of the sensors over time.
-        since: ids of the candidate and of all later ones.
+        since: place of the first trial of the candidate or of a later one.
     """
     made = tried.candidate
     missed = noise_missed(task, made, noises.before(since, made.seen))
@@ -155,12 +160,12 @@ def to_settle(incumbent: Tried, loser: Tried, most: int, once: int = 2) -> Tried
     return next((one for one, runs in either if len(one.trials) < runs), None)
 
 
-def with_chances(history: Sequence[Tried]) -> tuple[Tried, ...]:
+def with_chances(history: Sequence[Tried], pool: Repeats) -> tuple[Tried, ...]:
     """Return the candidates; every improvement gets the probability that it is one."""
     found, best = list(history), None
     for k, tried in enumerate(history):
         if tried.accepted and best is not None:
-            gained = Difference(best, tried, history)
+            gained = Difference(best, tried, history, pool)
             sure = gained.probability
             unsure = math.isnan(sure) and not gained.clear
             found[k] = replace(tried, probability=sure, unsure=unsure)

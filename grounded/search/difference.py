@@ -44,11 +44,13 @@ class Difference:
         before: a candidate that was run.
         after: another one.
         history: all candidates with their trials, whose repeats tell the scatter.
+        pool: these repeats, if they are known.
     """
 
     before: Tried
     after: Tried
     history: Sequence[Tried]
+    pool: Repeats | None = None
 
     @property
     def gain(self) -> float:
@@ -63,7 +65,7 @@ class Difference:
     @cached_property
     def repeats(self) -> Repeats:
         """All repeats in the history."""
-        return Repeats(self.history)
+        return self.pool or Repeats(self.history)
 
     @cached_property
     def scatter(self) -> Scatter:

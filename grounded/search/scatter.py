@@ -23,8 +23,9 @@ predicts a run with the noise of that mean, which is less than that of a log (`n
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -133,18 +134,30 @@ class NoiseSoFar:
         """The noise by the latest trials, (n,)."""
         return self._at(len(self.trials))
 
-    def before(self, candidates: Collection[str], seen: Collection[str] = ()) -> Array:
-        """Return the noise by the trials before the first of candidates; if none, by that one.
+    def first(self, candidate: str) -> int:
+        """Return the place of the first trial of a candidate among all, their number if none."""
+        return self._first.get(candidate, len(self.trials))
+
+    def before(self, first: int, seen: Sequence[str] = ()) -> Array:
+        """Return the noise by the trials before one; if it is the first, by that one.
 
         Args:
-            candidates: ids of a candidate and of those that were made later.
-            seen: ids of the search's trials when the candidate was made, after which trials are
-                none of its promise, such as a log that is data only.
+            first: place of the first trial of a candidate, or of one that was made later.
+            seen: ids of the search's trials when the candidate was made, in order of storage, after
+                which trials are none of its promise, such as a log that is data only.
         """
-        ran = (k for k, trial in enumerate(self.trials) if trial.candidate in candidates)
-        count = next(ran, len(self.trials))
-        last = [k + 1 for k, trial in enumerate(self.trials[:count]) if trial.id in seen]
-        return self._at(last[-1] if last else max(1, count))
+        places = (self._place.get(name, first) for name in reversed(seen))
+        last = next((k + 1 for k in places if k < first), None)
+        return self._at(last or max(1, first))
+
+    @cached_property
+    def _place(self) -> dict[str, int]:
+        return {trial.id: k for k, trial in enumerate(self.trials)}
+
+    @cached_property
+    def _first(self) -> dict[str, int]:
+        last = len(self.trials) - 1
+        return {trial.candidate: last - k for k, trial in enumerate(reversed(self.trials))}
 
     def _at(self, count: int) -> Array:
         if count not in self._found:
@@ -218,27 +231,38 @@ class Repeats:
         return Scatter(variance, nu + added, round(nu))
 
 
-def with_errors(history: Sequence[Tried]) -> tuple[Tried, ...]:
+def with_errors(history: Sequence[Tried], pool: Repeats) -> tuple[Tried, ...]:
     """Return the candidates, each with the standard deviation of a run of similar utility."""
-    near, placed = Repeats(history).near, explained_by_starts(history)
-    each = [(tried, near(tried.utility)) for tried in history]
+    share = StartShare()
+    for tried in history:
+        share.add(tried)
+    each = [(tried, pool.near(tried.utility)) for tried in history]
     return tuple(
-        replace(tried, deviation=math.sqrt(found.variance), repeats=found.repeats, placed=placed)
-        for tried, found in each
+        replace(t, deviation=math.sqrt(near.variance), repeats=near.repeats, placed=share.most)
+        for t, near in each
     )
 
 
-def explained_by_starts(history: Sequence[Tried]) -> bool:
-    """Return whether where runs began is most of what repeats scatter by, as the model tells."""
-    whole = left = 0.0
-    for tried in history:
+@dataclass
+class StartShare:
+    """How much of what repeats scatter by is due to where runs began, as the model tells."""
+
+    whole: float = 0.0  # sum of squares of the utilities of repeats
+    left: float = 0.0  # the same without what the starts cost
+
+    def add(self, tried: Tried) -> None:
+        """Add the repeats of a candidate."""
         if _repeated(tried) and tried.starts is not None:
             costs, worth = tried.starts.costs(tried), np.array(tried.utilities)
             if np.isfinite(costs).all():
                 with np.errstate(all="ignore"):  # of diverged runs
-                    whole += float(np.var(worth)) * len(worth)
-                    left += float(np.var(worth + costs)) * len(worth)
-    return left < LEFT * whole
+                    self.whole += float(np.var(worth)) * len(worth)
+                    self.left += float(np.var(worth + costs)) * len(worth)
+
+    @property
+    def most(self) -> bool:
+        """Whether it is most of it."""
+        return self.left < LEFT * self.whole
 
 
 def _repeated(tried: Tried) -> bool:

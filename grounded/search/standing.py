@@ -19,6 +19,7 @@ a state with what to run next.
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
@@ -282,8 +283,12 @@ def standing(
         model: fingerprint of the current planning model; a direction belongs to one model.
         planner: has that model, which tells what start states cost; None: that stays unknown.
     """
-    starts = Starts(planner) if planner else None
-    history, incumbent, iteration = judged(task, candidates, trials, options, model, starts)
+    of = [task, options, model, *candidates, *trials]
+    memory = planner.memory if planner else {}
+    if not _same(memory.get("of", ()), of):
+        starts = Starts(planner) if planner else None
+        memory.update(of=of, found=judged(task, candidates, trials, options, model, starts))
+    history, incumbent, iteration = memory["found"]
     total = sum(len(t.trials) for t in history)
     now = Standing(
         phase=Phase.PROPOSE,
@@ -318,6 +323,11 @@ def standing(
     improve = found("search.step", own, best=own, step=str(step), crashed=crashed)
     now = replace(now, step=step, findings=(improve,))
     return now.with_finding(_suspicion(history, incumbent, model))
+
+
+def _same(one: Sequence[object], other: Sequence[object]) -> bool:
+    """Check whether two lists hold the same objects."""
+    return len(one) == len(other) and all(map(operator.is_, one, other))
 
 
 def ended(now: Standing, ending: Ending, *findings: Finding) -> Standing:

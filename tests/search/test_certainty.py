@@ -9,6 +9,7 @@ from scipy.stats import ttest_ind
 from grounded.search.candidate import Tried
 from grounded.search.certainty import with_chances
 from grounded.search.difference import Difference, in_question
+from grounded.search.scatter import Repeats
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -54,5 +55,6 @@ def test_exact_repeats_show_at_any_utility_that_nothing_scatters():
     ],
 )
 def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repeats, word):
-    history = with_chances([tried(-90.0, base=""), tried(*repeats), tried(utility)])
+    history = [tried(-90.0, base=""), tried(*repeats), tried(utility)]
+    history = with_chances(history, Repeats(history))
     assert [one.verdict() for one in history] == ["first", "better", word]

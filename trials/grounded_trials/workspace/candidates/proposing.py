@@ -227,7 +227,7 @@ def _told(
     assert made is not None
     noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
     same = [t for t in now.history if t.candidate.id == made.id]
-    noise = noises.before([made.id], made.seen)
+    noise = noises.before(noises.first(made.id), made.seen)
     cost = same[0].noise_missed if same else noise_missed(task, made, noise)
     whole = noise_cost(task, made.policy, noise)
     ahead = off_target_of(task, [made.predicted_run])
