@@ -398,11 +398,7 @@ class _Table:
         """Return roles without enough points: with a number if as many fit, else with what fits."""
         left = [n for n in self.numbers if n.moves and n.path not in {*taken.values()}]
         lost = [role for role in self.roles if role.name not in taken]
-        tops: dict[str, list[str]] = {}
-        for role in lost:
-            row = self.points[self.row[role.name]]
-            fits = {n.path: row[self.at[n.path]] for n in left if row[self.at[n.path]] >= 1.0}
-            tops[role.name] = [p for p in fits if fits[p] > max(fits.values()) - LEAD]
+        tops = {role.name: self._best_fitting(role.name, left) for role in lost}
         inputs = [role.name for role in lost if role.sent]
         if by_order := by_order and not any(tops.values()) and self._any_order(taken, lost, left):
             tops |= {name: [number.path for number in left] for name in inputs}
@@ -427,6 +423,12 @@ class _Table:
         for role in (one for one in lost if one.name not in made):
             made[role.name] = self._offered(role, [n for n in left if n.path not in given])
         return made
+
+    def _best_fitting(self, role: str, left: Sequence[_Number]) -> list[str]:
+        """Return the numbers that fit a role about as well as the best one."""
+        row = self.points[self.row[role]]
+        fits = {n.path: row[self.at[n.path]] for n in left if row[self.at[n.path]] >= 1.0}
+        return [path for path in fits if fits[path] > max(fits.values()) - LEAD]
 
     def _any_order(
         self, taken: Mapping[str, str], lost: Sequence[_Role], left: Sequence[_Number]
