@@ -365,6 +365,20 @@ class Diagnosis(Document):
         return {name: e for name, e in self.parameters.items() if name not in lost}
 
     @property
+    def adoptable(self) -> dict[str, Estimate]:
+        """The calibrated parameters that are adopted with the effects: the trials identify them.
+
+        One that changed by less than its error is none if a bound cut it, or if it was 0.
+        """
+        nominal = {} if self.made is None else self.made.nominal
+
+        def tells(e: Estimate, was: float) -> bool:
+            return abs(e.value - was) > e.std or not (e.stopped or was == 0)
+
+        known = self.known_parameters.items()
+        return {name: e for name, e in known if tells(e, nominal.get(name, math.inf))}
+
+    @property
     def combined(self) -> set[str]:
         """The effects and parameters that the trials show only in combination."""
         return {name for one in self.combinations for name in one.values}

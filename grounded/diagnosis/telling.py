@@ -83,6 +83,7 @@ def cause_table(diagnosis: Diagnosis) -> tuple[tuple[Cells, ...], Cells]:
         values = "" if row is None else values_of(row)
         if one.of == CALIBRATION:
             names = [name for name in diagnosis.verdict.parameters if name in own]
+            names += [name for name in diagnosis.adoptable if name not in names]
             texts = [(name, f"{own[name].text}{_was(diagnosis, name)}") for name in names]
             shares = (percent(one.share), *("" for _ in texts))
             rows += [(*text, share) for text, share in zip(texts, shares, strict=False)]

@@ -100,26 +100,12 @@ def _numbers(effects: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, str, s
 # what a diagnosis offers
 
 
-def told_parameters(diagnosis: Diagnosis) -> dict[str, Estimate]:
-    """Return the calibrated parameters that may be adopted: the trials identify them.
-
-    One that changed by less than its error is none if a bound cut it, or if it was 0.
-    """
-    nominal = made_from(diagnosis).nominal
-
-    def tells(e: Estimate, was: float) -> bool:
-        return abs(e.value - was) > e.std or not (e.stopped or was == 0)
-
-    known = diagnosis.known_parameters.items()
-    return {name: e for name, e in known if tells(e, nominal.get(name, math.inf))}
-
-
 def left_behind(diagnosis: Diagnosis) -> dict[str, Estimate]:
     """Return the parameters, also of adopted effects, that changed in the fit but are not adopted.
 
     The prediction errors of the diagnosis include their changes.
     """
-    nominal, kept = made_from(diagnosis).nominal, told_parameters(diagnosis)
+    nominal, kept = made_from(diagnosis).nominal, diagnosis.adoptable
     return {
         name: e
         for name, e in diagnosis.parameters.items()
@@ -274,7 +260,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
 
     # The model with them.
     whole_fit = parameters and bool(physics) and claimed
-    calibrated = told_parameters(diagnosis) if whole_fit else {}
+    calibrated = diagnosis.adoptable if whole_fit else {}
     model, before = workspace.config.model, made_from(diagnosis).effects
     nominal = _nominal(workspace, diagnosis)
     own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
@@ -303,7 +289,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         ),
         along=tuple(name for name in names if name not in asked),
         left={name: one.value for name, one in left.items()},
-        then=to_plan(workspace),
+        then=AGAIN if claimed and diagnosis.leftover else to_plan(workspace),
     )
     named = [effect for effect in adopted if effect["name"] in asked]
     told = [*_readings(workspace.base_model, named)]
@@ -585,7 +571,7 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     if diagnosis is not None:
         new = diagnosis.open(table.effects, table.params)
         names = [name for name in diagnosis.joining if name in new and diagnosis.ranked(name)]
-        known = {n: e for n, e in told_parameters(diagnosis).items() if math.isfinite(e.value)}
+        known = {n: e for n, e in diagnosis.adoptable.items() if math.isfinite(e.value)}
         nominal = _nominal(workspace, diagnosis)
         params, effects = joined(diagnosis, names, table.effects, nominal, known)
         own = {name: value for name, value in params.items() if name in task.model.params}
@@ -656,7 +642,7 @@ def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
     made, now = made_from(diagnosis), {str(e["name"]): dict(e) for e in table.effects}
     both = [*diagnosis.effects, *(name for name in diagnosis.late_sensors if name in now)]
     try:
-        known = told_parameters(diagnosis)
+        known = diagnosis.adoptable
         own, effects = joined(diagnosis, both, made.adopted, made.nominal, known)
     except (GroundedError, KeyError):  # a document of an older version
         return False
