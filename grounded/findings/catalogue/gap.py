@@ -124,7 +124,7 @@ ENTRIES: dict[str, Entry] = {
     "next.adopt": Entry(
         "note",
         "no trial is needed: {own:yes=fit the model's parameters,no=adopt the claimed effects}"
-        "[[left?  and diagnose again]]",
+        "[[left?; a diagnosis after it may tell more]]",
     ),
     "next.doubt": Entry(
         "note",

@@ -289,7 +289,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         ),
         along=tuple(name for name in names if name not in asked),
         left={name: one.value for name, one in left.items()},
-        then=AGAIN if claimed and diagnosis.leftover else to_plan(workspace),
+        then=to_plan(workspace),
     )
     named = [effect for effect in adopted if effect["name"] in asked]
     told = [*_readings(workspace.base_model, named)]
