@@ -281,7 +281,7 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
 class Derived(NamedTuple):
     """The weights of past differences of a position in a velocity, summarised.
 
-    Args:
+    Attributes:
         gain: their sum.
         gain_std: its standard deviation.
         age: their mean age [s].

@@ -53,7 +53,7 @@ class Row:
 class Gap(NamedTuple):
     """The difference between a row's prediction and its own sensor.
 
-    Args:
+    Attributes:
         share: rms of the difference, relative to how far the state (or others of its unit) moves.
         varying: the same without a constant difference.
         rate: rms of the difference per time [unit/s].

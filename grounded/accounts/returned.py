@@ -138,7 +138,7 @@ def likeliest(some: Iterable[Story | None], as_logged: Story) -> Story:
 class Row(NamedTuple):
     """One entry of the table: what the policy was given, and what it was, before any score.
 
-    Args:
+    Attributes:
         policy: as it acts.
         run: the trial with its columns as the policy got them.
         stories: that the log is so, or that the robot's program made it so; not scored yet.
