@@ -21,7 +21,6 @@ import grounded.diagnosis.diagnose as diagnosing
 from grounded.challenge import KINDS, judge, make, of_crude, oracle, task_of
 from grounded.challenge.score import share
 from grounded.diagnosis.validation import choose
-from grounded.diagnosis.validation.choose import Comparison
 from grounded.diagnosis.validation.decide import Options, decide
 
 CURVES = {
@@ -55,9 +54,8 @@ def fitted(case):
     label = of_crude(case.label, case.model)
     true = oracle(case.model, case.trials, case.latency, label, document["ranking"])
     ruler = kept["ruler"]
-    compare = Comparison(ruler.shown, ruler._matters(), ruler.unit)
     return {
-        "options": list(known.values()), "less": less, "compare": compare, "label": label,
+        "options": list(known.values()), "less": less, "compare": ruler.comparison, "label": label,
         "oracle": true, "document": document, "marks": judge(label, document, true),
         "held_out": ruler.held_out,
     }  # fmt: skip

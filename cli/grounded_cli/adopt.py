@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from collections.abc import Iterator
 
 import click
 
@@ -12,7 +11,7 @@ from grounded_cli.console.options import command, flag, misuse
 from grounded_cli.console.terminal import field, sentence, show, tell
 from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_trials.wording import ALONE, moved
-from grounded_trials.workspace.adoption import Adopted, Undone
+from grounded_trials.workspace.adoption import Adopted, Undone, numbers_in
 
 DIGITS = 4  # of a parameter, at least
 
@@ -35,7 +34,7 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
         raise misuse("EFFECT...", "--undo")
     workspace = open_workspace()
     before, file = workspace.base_model.params, workspace.config.file
-    were = _numbers(workspace.config.model.effects)
+    were = numbers_in(workspace)
     if undo:
         done: Adopted | Undone = workspace.undo_adoption()
     else:
@@ -56,16 +55,11 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
     for name, value in values.items():
         text = moved(before[name].value, value, before[name].unit, DIGITS)
         show(field(name, text + ALONE * (name in jointly), "  "))
-    known = _numbers(workspace.config.model.effects)
-    if changed := {name: v for name, v in known.items() if were.get(name, v) != v}:
+    known = numbers_in(workspace)
+    if changed := {name: one for name, one in known.items() if were.get(name, one) != one}:
         show("[model] effects:")
-    for name, value in changed.items():
-        show(field(name, moved(were[name], value, "", DIGITS), "  "))
+    for name, (value, unit) in changed.items():
+        show(field(name, moved(were[name][0], value, unit, DIGITS), "  "))
     if isinstance(done, Undone):
         show(field("adopted", ", ".join(str(one["name"]) for one in done.effects) or "none"))
     show(f"\n{next_line(done.then)}")
-
-
-def _numbers(effects: Iterable[Mapping[str, Any]]) -> dict[str, float]:
-    """Return the numbers of the effects in [model], as they are called."""
-    return {f"{q} of {e['name']}": v for e in effects for q, v in e.items() if q != "name"}

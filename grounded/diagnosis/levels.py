@@ -12,7 +12,7 @@ PICKED = 5.0  # of what was picked among many: a cause, a leftover, a changed va
 
 # standard errors, and chance
 ERRORS = 1.0  # by which one prediction is better than another ("Decide")
-SURE = 2.0  # from which a value differs from zero, or one prediction is better ("Decide")
+SURE = 2.0  # from which a value differs from zero, or a prediction is clearly better ("Decide")
 MANY = 3.0  # the same for the most striking of many: channels, trials, regions ("Leftover")
 CHANCE = 1e-3  # p-value below which trials disagree, or noise is not white ("Values")
 

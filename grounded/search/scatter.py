@@ -143,12 +143,12 @@ class NoiseSoFar:
 
         Args:
             first: place of the first trial of a candidate, or of one that was made later.
-            seen: ids of the search's trials when the candidate was made, in order of storage, after
-                which trials are none of its promise, such as a log that is data only.
+            seen: ids of the search's trials when the candidate was made, after which trials are
+                none of its promise, such as a log that is data only.
         """
-        places = (self._place.get(name, first) for name in reversed(seen))
-        last = next((k + 1 for k in places if k < first), None)
-        return self._at(last or max(1, first))
+        places = (self._place.get(name, first) for name in seen)
+        last = max((k + 1 for k in places if k < first), default=max(1, first))
+        return self._at(last)
 
     @cached_property
     def _place(self) -> dict[str, int]:

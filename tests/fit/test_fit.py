@@ -159,7 +159,7 @@ def test_held_out_errors_decide_whether_a_fit_helps():
 
     def judged(mean, whole=0.0):
         gain, loss = (
-            Gain(m, m, np.full(2, m), [(m, 0.02)] * 2, (m, 0.02), (w, 0.001))
+            Gain(m, m, np.full(2, m), (m, 0.02), (w, 0.001))
             for m, w in ((mean, whole), (-mean, -whole))
         )
         return dataclasses.replace(found, gain=gain, loss=loss)

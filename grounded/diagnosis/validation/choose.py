@@ -31,7 +31,7 @@ the standard error. So no more is asked of predictions, and more of the evidence
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -109,7 +109,8 @@ class Rule:
         most = max(option.evidence for option in small)
         tied = [option for option in small if option.evidence > most - NATS]
         chosen = min(tied, key=lambda option: (option.order, -option.evidence))
-        return Choice(chosen, reference, *self.gain(chosen.errors, reference.errors).paired)
+        apart = self.gain(chosen.errors, reference.errors)
+        return Choice(chosen, reference, apart.mean, apart.paired[1])
 
     def gained(self, option: Option) -> float:
         """Return the gain since the outset."""
@@ -158,7 +159,6 @@ class Gain:
     mean: float  # of the rms errors over all trials, mean over channels and horizons
     largest: float  # the same of any channel and horizon
     channels: Array  # (n',) the same by shown state, mean over horizons
-    by_channel: Sequence[tuple[float, float]]  # `paired` of each shown state
     paired: tuple[float, float]  # mean over trials of each trial's damped gain, its standard error
     whole: tuple[float, float] = (0.0, 0.0)  # the same of whole trials
 
@@ -212,10 +212,13 @@ class Comparison:
             float(ratio.sum() / max((sums[2] > 0).sum(), 1)),
             float(ratio.max()),
             ratio.sum(axis=(0, 1)) / seen,
-            [over_trials(each[..., [i]], count[..., [i]] > 0) for i in range(each.shape[-1])],
             over_trials(each, count > 0),
             over_trials(each[-1:], count[-1:] > 0),
         )
+
+    def of_channel(self, i: int) -> Comparison:
+        """Return the comparison of the errors of one shown state."""
+        return replace(self, shown=[self.shown[i]], matters=self.matters[:, [i]])
 
     def _by_unit(self, values: Array) -> Array:
         """Return sums over pieces by unit, (K, U, n') of (K, P, n)."""

@@ -216,9 +216,14 @@ class Ruler:
         """Return the gain of one set of errors over another."""
         known = self._compared.get((id(before), id(after)))
         if known is None:
-            known = Comparison(self.shown, self._matters(), self.unit)(before, after)
+            known = self.comparison(before, after)
             self._compared[id(before), id(after)] = known
         return known
+
+    @property
+    def comparison(self) -> Comparison:
+        """How errors are compared."""
+        return Comparison(self.shown, self._matters(), self.unit)
 
     def _matters(self) -> Array:
         """Return the error below which differences are negligible, (K, n')."""

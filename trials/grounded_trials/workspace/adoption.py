@@ -527,6 +527,12 @@ def units_of(workspace: Folder, effect: str) -> dict[str, str]:
     return units | {q.name: q.unit for q in known}
 
 
+def numbers_in(workspace: Folder) -> dict[str, tuple[float, str]]:
+    """Return the numbers of the adopted effects with their units, as they are called."""
+    numbers = _numbers(workspace.config.model.effects)
+    return {f"{q} of {e}": (v, units_of(workspace, e).get(q, "")) for e, q, _, v in numbers}
+
+
 def known_values(workspace: Folder, diagnosis: Diagnosis | None = None) -> dict[str, Estimate]:
     """Return the values of parameters and adopted effects, by parameter name, with their +-.
 

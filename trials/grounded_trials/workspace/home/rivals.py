@@ -164,7 +164,9 @@ def _result(
     way, gain = a.better(b), a.gain(b)
     better = {1: labels[1], -1: labels[0]}.get(way)
     ahead = len(a.by_horizon) - 2 if len(a.by_horizon) > 1 else 0  # the last one before the whole
-    sure = [abs(more) > max(SURE * error, LEAST) for more, error in gain.by_channel]
+    each = [a.ruler.comparison.of_channel(i) for i in range(len(gain.channels))]
+    paired = (one(a.errors, b.errors).paired for one in each)
+    sure = [abs(more) > max(SURE * error, LEAST) for more, error in paired]
     (ahead_s, first), (_, second) = a.by_horizon[ahead], b.by_horizon[ahead]
     where = {
         name: Decided(labels[int(more > 0)] if clear else None, errors=(first[name], second[name]))
