@@ -135,7 +135,8 @@ def main():
         timed("status", *at, "status")
     timed("propose, new", *at, "propose")
     timed("propose", *at, "propose")
-    told = json.loads(timed("run", *at, "run", "--json"))
+    told = timed("run", *at, "run", "--json")
+    told = json.loads(told[told.index("{\n") :])  # notes on stderr come before
     timed("ingest", *at, "ingest", told["trial_file"])
     timed("report", *at, "report")
     timed("report --html", *at, "report", "--html")
