@@ -53,7 +53,6 @@ _GROUP = re.compile(r"[tTcC]?\d+(,[tTcC]?\d+)*")
     shell_complete=complete.trials,
     help="Two groups of trials, T1,T2 T3,T4: what changed. Or two models: which predicts better.",
 )
-@flag("--probe", help="Write the most informative next trial, even without a tie.")
 @partial(parallel, by_itself=True)
 @flag("--instruments", help="Check the sensors only; takes some seconds.")
 @flag("--details", help="Also all findings, errors, rival effects and places.")
@@ -62,7 +61,6 @@ def diagnose(
     max_effects: int | None,
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
-    probe: bool,
     engine: Engine,
     instruments: bool,
     details: bool,
@@ -103,7 +101,6 @@ def diagnose(
             max_effects=max_effects,
             without=[name for text in without for name in names_in(text)],
             compare=second,
-            probe=probe,
             engine=engine,
             progress=stage,
         )

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from grounded.engine import Engine
-from grounded.experiments import car, flight, footnote9, nondeterminism, theorem1
+from grounded.experiments import car, flight, footnote9, theorem1
 from grounded.refusals import wrong
 from grounded_cli.console.options import command, misuse, parallel
 from grounded_cli.console.terminal import bar, show, table
@@ -20,7 +20,6 @@ from grounded_trials.store.documents import StudyStore
 STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
     "flight": (flight.run, "count", "Table 1, Figure 1"),
     "car": (car.run, "seeds", "Figures 4, 5"),
-    "nondeterminism": (nondeterminism.run, "runs", "section 5.2"),
     "footnote9": (footnote9.run, "", "footnote 9"),
     "theorem1": (theorem1.run, "seeds", "theorem 1"),
 }
@@ -91,6 +90,4 @@ def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
         return {"seeds": chosen}
     if chosen != list(range(chosen[0], chosen[-1] + 1)):
         raise _unlike(text)
-    if kind == "runs":
-        return {"runs": len(chosen), "seed": chosen[0]}
     return {"count": len(chosen), "first_seed": chosen[0]}

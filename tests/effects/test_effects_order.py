@@ -1,10 +1,9 @@
-"""Several effects together: diagnosis, probe and adopted model agree which of them acts first."""
+"""Several effects together: diagnosis and adopted model agree which of them acts first."""
 
 import numpy as np
 import pytest
 
 from grounded import Trial
-from grounded.diagnosis.excitation import _run
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -61,12 +60,6 @@ def predicted(parts, model=car, leads=False):
     return np.array(x)
 
 
-def probed(parts):
-    """What a probe simulates."""
-    one = task()
-    return _run(one, hypothesis(parts), one.policy(commands(), None, None)).states
-
-
 def adopted(parts):
     """What the adopted model plans with: a delay is latency, the rest is in the model."""
     plan = planner_of(task(), [{"name": name, **values} for name, values in parts]).plan
@@ -104,7 +97,6 @@ def adopted(parts):
 )
 def test_one_order_everywhere(parts):
     want = predicted(parts)
-    np.testing.assert_allclose(probed(parts), want, atol=1e-9)
     np.testing.assert_allclose(adopted(parts), want, atol=1e-9)
 
 
@@ -112,8 +104,6 @@ def test_one_order_everywhere(parts):
 def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(parts):
     off = np.abs(adopted(parts) - predicted(parts, leads=True)).max(axis=0)
     assert off[car.state_names.index("delta")] < 6e-4 and off.max() < 0.015
-    near = np.abs(probed(parts) - predicted(parts, leads=True)).max(axis=0)
-    assert near.max() < 0.12  # a probe takes the mean
 
 
 def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():

@@ -10,7 +10,6 @@ from grounded.errors import GroundedError
 from grounded.experiments.car import CarResult, CarRun
 from grounded.experiments.flight import FlightResult, FlightRun
 from grounded.experiments.footnote9 import Footnote9Result, Footnote9Row
-from grounded.experiments.nondeterminism import EndPointSpread, NondeterminismResult
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded.figures.figure import Bars
 from grounded.figures.interactive import plotted
@@ -40,13 +39,9 @@ def results():
         for e in (0.01, 0.1)
         for s in (0, 1)
     ]
-    spreads = tuple(
-        EndPointSpread("circle", level, 0.1 * level, 0.2 * level) for level in (0.0, 1.0, 3.0)
-    )
     return {
         "flight": FlightResult((flown(0, 1.0), flown(1, 2.0)), -1826.0, LOOP.tolist()),
         "car": CarResult(tuple(cars)),
-        "nondeterminism": NondeterminismResult(spreads, 5),
         "footnote9": Footnote9Result((Footnote9Row(5.0, 1e-11, 1.0, 2, 1e-11, 21),)),
         "theorem1": Theorem1Result(tuple(theorem)),
     }

@@ -143,7 +143,7 @@ def test_the_gyro_shows_all_that_turns_the_real_car():
 def test_nothing_that_searches_or_diagnoses_can_see_the_real_car():
     """Only studies and the examples' real.py import it."""
     root = Path(grounded.__file__).parents[1]
-    allowed = ("experiments", "examples.py", "real_car.py", "nondeterminism.py")
+    allowed = ("experiments", "examples.py", "real_car.py")
     for path in [
         *root.glob("grounded/**/*.py"),
         *root.glob("trials/**/*.py"),

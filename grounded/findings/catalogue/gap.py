@@ -184,18 +184,16 @@ ENTRIES: dict[str, Entry] = {
     "next.fix": Entry("warn", FIX),
     "next.probe": Entry(
         "note",
-        "[[run {candidate}, ]]{probe}: [[expected to tell {effect} from {others} by {by:.3g} "
-        "nats]][[would tell {value} to +- {after:size}]][[ instead of {now:size}]]"
-        "[[motion? would show whether the values hold in another motion]]",
+        "[[run {candidate}, ]]{probe}: expected to tell {effect} from {others} by {by:.3g} nats",
     ),
     "no_probe": Entry(
         "note",
-        "no probe[[ ({why})]][[{which:unsafe=: none that was tried stays inside [safety] and near "
-        "the trials,run=: it varies the best candidate and no run was complete}]]",
+        "no probe[[ ({why})]][[!why?: none that was tried stays inside [safety] and near the "
+        "trials]]",
     ),
     "next.no_probe": Entry(
         "note",
-        "no run inside the limits would tell [[{effect} from {others}]][[{value} better]]",
+        "no run inside the limits would tell {effect} from {others}",
         "[[claimed? adopt {claimed}]][[!claimed? record larger inputs or another manoeuvre]]",
     ),
     # two models

@@ -14,7 +14,6 @@ from grounded.experiments.figure8 import DT
 from grounded.experiments.flight import FIGURE_STEP, FlightResult
 from grounded.experiments.footnote9 import Footnote9Result
 from grounded.experiments.jobs import mean_se
-from grounded.experiments.nondeterminism import NondeterminismResult
 from grounded.experiments.theorem1 import Theorem1Result, Theorem1Row
 from grounded.figures.figure import (
     STEPS,
@@ -36,7 +35,6 @@ from grounded_trials.store.store import made_folder, write_atomically
 
 FIRST, LAST, DESIRED = "the model’s controller", "after learning", "desired"
 PAPER_FIGURE = {"turn": 4, "circle": 5, "figure8": 5}
-PAPER_SPREAD = 50.0  # [cm] largest distance reported in the paper
 SMALLEST = 1e-300  # lower bound of arguments of the logarithm
 
 
@@ -217,26 +215,9 @@ def footnote9_figure(result: Footnote9Result) -> Figure:
     )
 
 
-def nondeterminism_figure(result: NondeterminismResult) -> Figure:
-    """Draw the largest distance between end points, by scatter and sequence, on one scale."""
-    roles = ("other", "best", "model")
-    bars, keys = [], []
-    for i, level in enumerate(sorted({s.level for s in result.spreads})):
-        role = roles[min(i, len(roles) - 1)]
-        keys.append(Key(role, f"scatter x{level:g}", "disc"))
-        for s in result.spreads:
-            if s.level == level:
-                cm = 100 * s.largest
-                bars.append(Bar(f"{s.sequence}, x{level:g}", cm, f"{cm:.1f} cm", role))
-    bars.append(Bar("the paper’s car, at most", PAPER_SPREAD, f"{PAPER_SPREAD:.0f} cm", "desired"))
-    panel = Bars(f"Largest distance between end points, {result.runs} runs of 2 s", tuple(bars))
-    return Figure("nondeterminism", "Repeated runs with the same inputs", "", (panel,), tuple(keys))
-
-
 PICTURES: dict[str, Callable[[Any], Figure]] = {
     "flight": flight_figure,
     "car": car_figure,
-    "nondeterminism": nondeterminism_figure,
     "footnote9": footnote9_figure,
     "theorem1": theorem1_figure,
 }

@@ -15,7 +15,6 @@ from grounded.accounts.kinematics import unheld
 from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import gain, open_noise
-from grounded.diagnosis.excitation import SEPARABLE_NATS, probe
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
 from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
@@ -24,6 +23,7 @@ from grounded.findings import Finding, Quantity, Weight
 from grounded.findings import found as finding
 from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate
+from grounded.search.design import probe
 from grounded.search.safety import objections, spread
 from grounded.search.standing import LOST
 from grounded.share import Share
@@ -77,7 +77,6 @@ def diagnose_in(
     without: Sequence[str] = (),
     library: Library | None = None,
     compare: Sequence[str] = (),
-    probe: bool = False,
     engine: Engine | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Diagnosis:
@@ -95,7 +94,6 @@ def diagnose_in(
         without: effect families to exclude.
         library: the effects to consider; None: the installed ones.
         compare: a second group of trials; the result's `changed` lists what differs from the first.
-        probe: write the most informative probe even if no two explanations tie.
         engine: workers that fit hypotheses; their number does not change the result.
         progress: called with each stage.
     """
@@ -144,7 +142,7 @@ def diagnose_in(
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
     try:
-        identity, step = _probe(workspace, found, lifted + apart, library, write=probe)
+        identity, step = _probe(workspace, found, lifted + apart, library)
     except Exception as error:  # a failed probe must not lose the diagnosis
         if not isinstance(error, GroundedError):  # a bug in grounded: log its traceback too
             logging.getLogger(__name__).error("the probe failed, please report it", exc_info=error)
@@ -277,37 +275,34 @@ def unwritten_in(workspace: Folder) -> list[Finding]:
 
 
 def _probe(
-    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library, *, write: bool
+    workspace: Folder, found: Diagnosis, trials: Sequence[Trial], library: Library
 ) -> tuple[str, Finding | None]:
     """Write the candidate that would separate two tied effects; return its id and the next step.
 
     The candidate is one that `run` and `export` accept: inside the current [limits], and inside
-    [safety] with a margin as large as runs have strayed. With `write` one is written even if
-    nothing is tied. The id is "" if none is written, the step None if that of the diagnosis holds.
+    [safety] with a margin as large as runs have strayed. The id is "" if none is written, the step
+    None if that of the diagnosis holds.
     """
-    if found.no_cause or (found.changed and not write):
-        return "", None  # the latter: of one of two robots, which is to be diagnosed alone
+    ties = {*found.indistinguishable} - {*found.equivalent}
+    if found.no_cause or found.changed or not ties:  # of two robots, one is to be diagnosed alone
+        return "", None
     now = standing_in(workspace)
     best = now.incumbent
-    ties = {*found.indistinguishable} - {*found.equivalent}
     if best is None:
-        return "", finding("gap.no_probe", which="run") if write else None
+        return "", None
     planner = workspace.planner
     task, strays = planner.task, spread(planner.task, now.history, best.candidate.model)
     own = best.candidate.policy
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
     base = planner.widened(replace(own, low=low, high=high))
-    offer = write or bool(ties)
     plan = near(planner.plan, task.model.n, trials)
     for room in (0 * strays.size, strays.size):
         inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:
             break
-        worth = not made.little or (write and (not ties or made.expected >= SEPARABLE_NATS))
-        asks = offer and not found.contested  # it is the trial that is asked for, if one
-        if not (worth and offer):
-            return "", made.step if asks else None
+        if made.little:
+            return "", None if found.contested else made.step
         policy = planner.narrowed(made.policy)
         run = simulate(planner.plan.problem(exact=True), planner.widened(policy))
         candidate = probe_candidate(workspace, policy, run, best.candidate.id, run.utility)
@@ -316,7 +311,7 @@ def _probe(
             saved = workspace.save_probe(candidate)
             facts = {**made.step.facts, "candidate": saved.id}
             return saved.id, replace(made.step, facts=facts)
-    return "", finding("gap.no_probe", which="unsafe") if offer else None
+    return "", finding("gap.no_probe")
 
 
 def probe_candidate(

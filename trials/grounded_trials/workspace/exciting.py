@@ -1,4 +1,4 @@
-"""excite: the drive to record first, by the crude model alone; see `grounded.diagnosis.design`."""
+"""excite: the drive to record first, by the crude model alone; see `grounded.search.design`."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from grounded.checks import wrong
-from grounded.diagnosis.design import Drive, design
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 from grounded.result import UNSAID, Document
+from grounded.search.design import Drive, design
 from grounded.search.scatter import sensor_noise
 from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.adoption import known_values

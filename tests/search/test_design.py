@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.diagnosis.design import design
-from grounded.diagnosis.excitation import KnownNoise, information
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.validation.identifiable import WEAK
 from grounded.model import Param
 from grounded.models import arm, cart_pole, pendulum
 from grounded.rollout import simulate
+from grounded.search.design import KnownNoise, design, information
 from grounded.solve import ddp
 from grounded.trial import Trial
 from small_tasks import cart, plain_task
@@ -49,11 +47,9 @@ def usual(task):
 
 def left_by(task, run, noise):
     """What a run leaves of each uncertain parameter's standard deviation, as a share of it."""
-    sensor, still = 2 * np.log(noise), np.full(task.model.n, -60.0)
-    q = 2 * np.log(0.1 * noise)
-    known = KnownNoise(NoiseModel(Structure(), q, sensor, q, still), ())
+    known = KnownNoise.of(2 * np.log(0.1 * noise), 2 * np.log(noise), ())
     h = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0)
-    F = information(task, [run], h, known)
+    F = information(task, run, h, known)
     shares = np.sqrt(np.diag(np.linalg.inv(F + np.eye(len(F)))))
     return dict(zip(task.model.uncertain, shares, strict=True))
 
