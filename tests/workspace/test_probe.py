@@ -29,7 +29,7 @@ def made(tmp_path_factory):
 
 @pytest.fixture
 def diagnosed(made, tmp_path, monkeypatch):
-    """A copy of it in which `diagnose` finds that again, at once, with a tie; any probe is worth a trial."""
+    """A copy of it in which `diagnose` finds that again, with a tie that any probe tells."""
     folder, found = made
     tied = replace(found, indistinguishable=(TIE,), equivalent=())
     monkeypatch.setattr("grounded_trials.workspace.diagnosing.diagnose", lambda *_, **__: tied)
