@@ -1,13 +1,11 @@
 """Engine: where independent pieces of work run. Results do not depend on the number of workers.
 
-The jobs of a study run through joblib: as processes on this machine (extra `studies`), or as tasks
-of an existing Dask cluster through Dask's joblib backend (extra `cluster`). The pieces of one
-computation (`each`: records of a fit, hypotheses of a diagnosis) are short, numerous and share
-their data. On Linux they run in copies of this process (`forked`). Elsewhere, and where they step a
-simulator, which may have threads or connections that a copy lacks, they run in threads. On a
-cluster, data that all of them read is sent once (`SentOnce`).
+The jobs of a study are processes of their own (`processes`). The pieces of one computation (`each`:
+records of a fit, hypotheses of a diagnosis) are short, numerous and share their data. On Linux they
+run in copies of this process (`forked`). Elsewhere, and where they step a simulator, which may have
+threads or connections that a copy lacks, they run in threads.
 
-Both use one BLAS thread and keep freed memory (`steady`). The matrices are small, so OpenBLAS's own
+All use one BLAS thread and keep freed memory (`steady`). The matrices are small, so OpenBLAS's own
 threads wait for each other (three times the CPU of a diagnosis on two busy cores) and change the
 order of summation. The arrays are large enough that the C library returns each to the system,
 which then clears every page of the next one: 40 % of the time of a diagnosis.
@@ -18,27 +16,22 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import Executor, ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
 from contextlib import ExitStack, closing, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from functools import cache, partial
-from pathlib import Path
+from multiprocessing import get_context
 from typing import Any, TypeVar
 
 import numpy as np
 
-from grounded.checks import one_of, refused, wrong
-from grounded.errors import needs
+from grounded.checks import wrong
 from grounded.forked import Forks, possible
 
 STACK = 16 * 2**20  # [bytes] stack size of a thread: kernels keep their matrices there
-CONNECT_S = 10.0  # [s] timeout for a cluster's scheduler to answer
 TRIM, MAP = -1, -3  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD of the GNU C library
-LOAD, TASKS = Path("/proc/loadavg"), Path("/proc/self/task")  # runnable threads: all, and these
-LOOKS, LOOK_S = 5, 0.002  # that they are counted, and [s] between
 REUSED_BYTES = 2**28  # [bytes] freed blocks up to this size are reused
 T = TypeVar("T")
 
@@ -72,79 +65,41 @@ def cores() -> int:
         return os.cpu_count() or 1
 
 
-def idle() -> int:
-    """Return the number of processors that nobody else uses now, at least 1; all if unknown."""
-    here, busy = cores(), list[int]()
-    try:
-        for _ in range(LOOKS):
-            states = [stat.read_text().rpartition(")")[2] for stat in TASKS.glob("*/stat")]
-            mine = sum(state.startswith(" R") for state in states)
-            busy.append(int(LOAD.read_text().split()[3].partition("/")[0]) - mine)
-            time.sleep(LOOK_S)
-    except OSError:  # not Linux
-        return here
-    return max(1, here - sorted(busy)[LOOKS // 2])
-
-
 @dataclass(frozen=True)
 class Engine:
-    """Where independent pieces of work run.
-
-    Args:
-        jobs: number of workers on this machine; 1 runs everything in this process.
-        name: "local", or "dask" for a running cluster.
-        address: address of the cluster's scheduler, such as "tcp://10.0.0.1:8786"; required with
-            "dask" only.
+    """Workers on this machine: processes, copies or threads; 1 runs everything in this process.
 
     Raises:
-        GroundedError: if `jobs` is below 1, `name` is unknown, or `address` does not match `name`.
+        GroundedError: if `jobs` is below 1.
     """
 
     jobs: int = 1
-    name: str = "local"
-    address: str | None = None
 
     def __post_init__(self) -> None:
         if self.jobs < 1:
             raise wrong("--jobs", self.jobs, must="whole", low=1)
-        one_of("--engine", self.name, ("local", "dask"))
-        if (self.name == "dask") != (self.address is not None):
-            pair = ("--engine dask", "--address (tcp://host:8786)")
-            raise refused("given.either", *pair, how="both")
 
-    @property
-    def alone(self) -> bool:
-        """Whether everything runs in this process, one piece after the other."""
-        return self.name == "local" and self.jobs == 1
 
-    @contextmanager
-    def pool(self, **settings: Any) -> Iterator[Any]:
-        """Open a `joblib.Parallel` on these workers; closes the connection, not the cluster.
+def processes(engine: Engine, function: Callable[[Any], T], rows: Sequence[Any]) -> Iterator[T]:
+    """Yield function(row) of all rows as they are found, in any order.
 
-        Args:
-            settings: passed on to `joblib.Parallel`.
+    Args:
+        engine: how many processes.
+        function: a module-level function; it, its arguments and results must be picklable.
+        rows: its arguments.
 
-        Raises:
-            GroundedError: if joblib or Dask is missing, or no scheduler answers.
-        """
-        joblib = needs("joblib", "studies")
-        if self.name == "local":
-            # One BLAS thread per worker: results don't depend on how many share the machine.
-            here = joblib.parallel_config(backend="loky", inner_max_num_threads=1)
-            with here, joblib.Parallel(n_jobs=self.jobs, **settings) as pool:
-                yield pool
-            return
-        distributed = needs("distributed", "cluster")
-        try:
-            client = distributed.Client(self.address, timeout=CONNECT_S)
-        except OSError as error:
-            raise refused("file.unreadable", self.address, why=str(error)) from error
-        try:
-            there = joblib.parallel_config(backend="dask", client=client)
-            with there, joblib.Parallel(n_jobs=-1, **settings) as pool:
-                yield pool
-        finally:
-            client.close()
+    Raises:
+        BrokenProcessPool: if a process ended by itself.
+    """
+    if engine.jobs == 1:
+        yield from map(function, rows)
+        return
+    pool = ProcessPoolExecutor(engine.jobs, get_context("spawn"))
+    try:
+        for done in as_completed([pool.submit(_steadily, function, (row,)) for row in rows]):
+            yield done.result()
+    finally:
+        pool.shutdown(cancel_futures=True)
 
 
 Results = Generator[tuple[int, Any], None, None]  # index of a piece, its result
@@ -159,24 +114,18 @@ def running(engine: Engine | None, *, copied: bool = True) -> Iterator[None]:
     Args:
         engine: the workers.
         copied: whether pieces may run in copies of this process; False if they step a simulator.
-
-    Raises:
-        GroundedError: as `Engine.pool`.
     """
-    if engine is None or engine.alone:
+    if engine is None or engine.jobs == 1:
         yield
         return
     with ExitStack() as stack:
         call: Call
-        if engine.name == "local" and copied and possible():
-            call = Forks(engine.jobs, (SentOnce,))
-        elif engine.name == "local":
+        if copied and possible():
+            call = Forks(engine.jobs, (Shared,))
+        else:
             stack.callback(threading.stack_size, threading.stack_size(STACK))
             threads = stack.enter_context(ThreadPoolExecutor(engine.jobs))
             call = partial(_threaded, threads)
-        else:
-            pool = stack.enter_context(engine.pool(batch_size=1, return_as="generator"))
-            call = partial(_sent, pool)
         before = _pool.set(call)
         try:
             yield
@@ -210,18 +159,13 @@ def _threaded(threads: Executor, function: Any, rows: Sequence[Any]) -> Results:
             ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread), ended)
 
 
-def _sent(pool: Any, function: Any, rows: Sequence[Any]) -> Results:
-    yield from enumerate(pool((_steadily, (function, row), {}) for row in rows))
-
-
 def each(
     function: Callable[..., T], *columns: Sequence[Any], done: Callable[[], None] | None = None
 ) -> list[T]:
     """Return [function(*row) for row in zip(*columns)], computed on the engine of `running`.
 
     Args:
-        function: a module-level function, so that it can be pickled; it must not modify shared
-            data.
+        function: must not modify shared data.
         columns: sequences of arguments, all of the same length.
         done: called after each piece.
     """
@@ -245,11 +189,5 @@ def _steadily(function: Callable[..., T], row: Sequence[Any]) -> T:
     return _quietly(function, row)
 
 
-class SentOnce:
-    """Base class of data that many pieces read.
-
-    Dask's backend sends an argument only once to each worker if its reported size is large.
-    """
-
-    def __sizeof__(self) -> int:
-        return 2**20
+class Shared:
+    """Base class of data that many pieces read, of which no result contains a part."""

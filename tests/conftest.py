@@ -17,8 +17,6 @@ EXTRAS = {
     "report": "jinja2",
     "notebook": "plotly",
     "png": "matplotlib",
-    "studies": "joblib",
-    "cluster": "distributed",
 }
 # Files with tests of more than 20 s: they go first, so that no worker waits at the end for one.
 LONG = ("test_notebooks", "test_docs", "test_experiments_paper", "test_udp_robot")

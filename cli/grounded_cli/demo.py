@@ -10,7 +10,7 @@ from typing import Any
 import click
 
 from grounded.diagnosis.telling import sentence, told
-from grounded.engine import Engine, idle
+from grounded.engine import Engine, cores
 from grounded.errors import NextCommand
 from grounded.refusals import refused
 from grounded.result import percent
@@ -61,7 +61,7 @@ def demo(name: str, folder: str | None) -> Iterator[dict[str, Any]]:
     save_optimum(workspace, best)
     with stages() as tell:
         tell("diagnosis")
-        some, engine = _few(workspace, status), Engine(idle())
+        some, engine = _few(workspace, status), Engine(cores())
         diagnosed = workspace.diagnose(
             some, max_effects=EFFECTS_SOUGHT if some else None, engine=engine, progress=tell
         )

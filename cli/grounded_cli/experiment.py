@@ -1,4 +1,4 @@
-"""grounded experiment: run the paper's studies, on one machine or on a cluster."""
+"""grounded experiment: run the paper's studies."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ on one worker or on fifty. `grounded.engine` decides where jobs run.
     finished    a mapping from a job's key to its result; jobs found in it are not run again. The
                 caller may keep it on disk, so that an interrupted study can be continued. The key
                 contains a hash of the sources, so that results of two versions are never mixed.
-    lost worker its job is run again (by Dask itself, or here after a process died), not the study.
+    lost worker the jobs that it leaves undone are run again, not the study.
 
 The module also has the statistics that studies report: means with standard errors, improvements,
 slopes, tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so
@@ -18,10 +18,10 @@ ratios or a ratio of means; both are given.
 from __future__ import annotations
 
 import hashlib
-import importlib
 import json
 import math
-from collections.abc import Callable, Iterable, Iterator, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, MutableMapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache
 from itertools import product
@@ -31,7 +31,7 @@ from typing import Any, TypedDict, TypeVar, Unpack
 import numpy as np
 
 from grounded.checks import refused
-from grounded.engine import Engine
+from grounded.engine import Engine, processes
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
 ROUNDS = 5  # most rounds in which jobs of lost workers are run again
@@ -86,7 +86,7 @@ def run_jobs(
         progress: called with the number of jobs done and the total.
 
     Raises:
-        GroundedError: if joblib or Dask is missing, or workers keep dying.
+        GroundedError: if workers keep dying.
     """
     engine, finished = engine or Engine(), {} if finished is None else finished
     results = {job.key: finished[job.key] for job in jobs if job.key in finished}
@@ -102,7 +102,11 @@ def run_jobs(
         progress(len(results), total)
     lost: BaseException | None = None
     for _ in range(ROUNDS):
-        lost = _round(waiting, engine, keep)
+        try:
+            for key, result in processes(engine, _call, waiting):
+                keep(key, result)
+        except BrokenProcessPool as error:
+            lost = error
         waiting = [job for job in waiting if job.key not in results]
         if not waiting:
             return [results[job.key] for job in jobs]
@@ -133,52 +137,9 @@ def run_study(
     return tuple(kind(**result) for result in tuples)
 
 
-def _round(
-    jobs: Sequence[Job], engine: Engine, keep: Callable[[str, dict[str, Any]], None]
-) -> BaseException | None:
-    """Run the jobs and keep their results; return the error of a lost worker, or None."""
-    wanted, foreign = {job.key for job in jobs}, False
-    try:
-        for key, result in _results(jobs, engine):
-            if key in wanted:
-                keep(key, result)
-            foreign |= key not in wanted
-    except _lost() as error:
-        return error
-    if foreign:
-        raise refused("run.workers")
-    return None
-
-
 def _call(job: Job) -> tuple[str, dict[str, Any]]:
     # through JSON and back, so that new results equal those read from disk
     return job.key, json.loads(json.dumps(job.function(**job.arguments)))
-
-
-def _results(jobs: Sequence[Job], engine: Engine) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield results as they arrive, in any order."""
-    if not jobs:
-        return
-    if engine.alone:
-        yield from map(_call, jobs)
-        return
-    together = "all" if engine.name == "dask" else "2*n_jobs"
-    with engine.pool(return_as="generator_unordered", batch_size=1, pre_dispatch=together) as pool:
-        yield from pool((_call, (job,), {}) for job in jobs)
-
-
-def _lost() -> tuple[type[BaseException], ...]:
-    """Return the errors that mean that a worker died; imported only after an error."""
-    kinds: list[type[BaseException]] = []
-    for module, name in (
-        ("joblib.externals.loky.process_executor", "TerminatedWorkerError"),
-        ("distributed.scheduler", "KilledWorker"),
-    ):
-        try:
-            kinds.append(getattr(importlib.import_module(module), name))
-        except ImportError:
-            continue
-    return tuple(kinds)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from grounded import engine, forked
+from grounded import forked
 from grounded.engine import Engine, each, running
 
 pytestmark = pytest.mark.skipif(not forked.possible(), reason="copies are made on Linux only")
@@ -98,18 +98,3 @@ def test_without_processes_left_all_is_computed_here(monkeypatch):
     monkeypatch.setattr(os, "fork", refused)
     with running(Engine(3)):
         assert each(slowly, list(range(5))) == [(i, HERE) for i in range(5)]
-
-
-def test_processors_that_others_use_are_not_idle(monkeypatch, tmp_path):
-    load, tasks = tmp_path / "loadavg", tmp_path / "task"
-    for thread, state in (("1", "R"), ("2", "S"), ("3", "R")):
-        (tasks / thread).mkdir(parents=True)
-        (tasks / thread / "stat").write_text(f"{thread} (a (b) R) {state} 1 1")
-    monkeypatch.setattr(engine, "LOAD", load)
-    monkeypatch.setattr(engine, "TASKS", tasks)
-    monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(4)))
-    for runnable, idle in (2, 4), (3, 3), (5, 1), (9, 1):
-        load.write_text(f"7.00 5.00 3.00 {runnable}/500 1234\n")
-        assert engine.idle() == idle
-    load.unlink()
-    assert engine.idle() == engine.cores() == 4

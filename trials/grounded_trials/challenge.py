@@ -5,9 +5,9 @@
     DIR/times.json         CPU time of the diagnoses [s]
     LABELS/single-0007.json  the label; it is accepted only with the hash in the manifest
 
-Keep the labels on another disk while the cases are diagnosed. Cases are independent jobs, on one
-machine or on a Dask cluster that shares the disk (`grounded.experiments.jobs`). Each diagnosis is
-stored in its own workspace, so an interrupted run continues where it stopped.
+Keep the labels on another disk while the cases are diagnosed. Cases are independent jobs
+(`grounded.experiments.jobs`). Each diagnosis is stored in its own workspace, so an interrupted run
+continues where it stopped.
 """
 
 from __future__ import annotations

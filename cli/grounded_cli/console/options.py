@@ -82,22 +82,17 @@ anyway = flag(
 def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[..., Any]:
     """Add the options of a command that can run in parallel, passed as `engine`.
 
-    by_itself: it runs on all idle processors unless --jobs says otherwise.
+    by_itself: it runs on all processors unless --jobs says otherwise.
     """
-    kinds, jobs_ = click.Choice(["local", "dask"]), click.IntRange(1)
-    cluster = "Here (default), or a Dask cluster that sees this disk."
-    default = "all idle" if by_itself else "1"
+    default = "all processors" if by_itself else "1"
     workers = f"Workers on this machine (default: {default})."
 
-    @click.option("--jobs", type=jobs_, metavar="N", help=workers)
-    @click.option("--engine", type=kinds, default="local", help=cluster)
-    @click.option("--address", metavar="URL", help="Scheduler of a Dask cluster.")
+    @click.option("--jobs", type=click.IntRange(1), metavar="N", help=workers)
     @functools.wraps(function)
-    def call(*args: Any, jobs: int | None, engine: str, address: str | None, **others: Any) -> Any:
-        from grounded.engine import Engine, idle
+    def call(*args: Any, jobs: int | None, **others: Any) -> Any:
+        from grounded.engine import Engine, cores
 
-        jobs = jobs or (idle() if by_itself and engine == "local" else 1)
-        return function(*args, engine=Engine(jobs=jobs, name=engine, address=address), **others)
+        return function(*args, engine=Engine(jobs or (cores() if by_itself else 1)), **others)
 
     return call
 

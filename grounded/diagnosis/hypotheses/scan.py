@@ -40,7 +40,7 @@ from grounded.effects import (
     RateFamily,
 )
 from grounded.effects.sensed import behind_logs
-from grounded.engine import SentOnce, each
+from grounded.engine import Shared, each
 from grounded.filter import kalman
 from grounded.frozen import Array
 
@@ -117,7 +117,7 @@ def _looked(context: _Context, block: Sequence[_Point]) -> _Results:
     return results
 
 
-class _Context(SentOnce):
+class _Context(Shared):
     """The fit's track, Jacobian and gains, shared by all candidates."""
 
     def __init__(self, predictor: Predictor, fit: Fitted) -> None:

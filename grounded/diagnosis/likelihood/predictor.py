@@ -59,7 +59,7 @@ from grounded.effects.losses import Left, Loads, ahead, loads, loads_from, solve
 from grounded.effects.medium import medium_of, through_it
 from grounded.effects.plain_step import adopted, quantities_of
 from grounded.effects.sensed import behind_logs, logged, moved_model, seen_names
-from grounded.engine import SentOnce
+from grounded.engine import Shared
 from grounded.frozen import Array
 from grounded.places import integrated, outright_states, partner
 from grounded.rollout import each_stepped, equal_rows
@@ -68,7 +68,7 @@ TOGETHER = 6000  # rows of states that are stepped at once
 
 
 @dataclass(frozen=True, eq=False)
-class Predictor(SentOnce):
+class Predictor(Shared):
     """Evaluate hypotheses on one `Data`. Shapes: tracks (L + 1, B, n), inputs (L, B, m)."""
 
     data: Data

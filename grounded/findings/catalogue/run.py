@@ -185,10 +185,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "workers": Entry(
         "refuse",
-        "[[{lost} of {total:job} lost their worker ({why})]][[!lost? a worker has another version "
-        "of grounded]]",
-        "[[lost? run the study again with fewer --jobs: finished jobs are kept]][[!lost? install "
-        "one on every machine]]",
+        "{lost} of {total:job} lost their worker ({why})",
+        "run the study again with fewer --jobs: finished jobs are kept",
     ),
     "viewer": Entry(
         "refuse",
