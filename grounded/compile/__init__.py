@@ -28,7 +28,6 @@ from grounded.compile.problem import (
     System,
     deepest,
 )
-from grounded.compile.run import jit
 from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
@@ -94,9 +93,6 @@ def system_from(signature: Signature, integrator: Integrator, derivatives: bool 
     found = trace(signature, None, 1.0)
     if isinstance(found, str):
         return DifferencedSystem(signature, integrator, f"not compiled, {found}")
-    trouble = jit.trouble()
-    if trouble:
-        return TracedSystem(signature, found, integrator, f"not compiled: {trouble}")
     if not derivatives and len(found.graph.live(found.outputs)) <= MAX_STEPS:
         return CompiledSteps(signature, found, integrator, "")
     system, place = CompiledSystem(signature, found, integrator), where(signature.function)

@@ -186,12 +186,3 @@ def test_bad_models_are_errors_naming_file_and_line(values, message):
     with pytest.raises(GroundedError, match=message) as caught:
         make(model).step(*points()[:2], np.array([0.7]), 0.1)
     assert "test_compile_trace.py:" in str(caught.value)
-
-
-def test_without_llvmlite_the_graph_is_interpreted(monkeypatch):
-    from grounded.compile.run import jit
-
-    monkeypatch.setattr(jit, "trouble", lambda: "llvmlite can't be imported")
-    system, (x, u, p) = make(with_where), points()
-    assert system.how == "traced" and "llvmlite" in system.note
-    assert np.allclose(system.step(x, u, p, 0.1), make(with_where).step(x, u, p, 0.1))
