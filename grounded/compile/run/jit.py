@@ -31,7 +31,7 @@ from grounded.trusted import suspicion
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
 MAGIC = b"grounded kernel 1\n"
 MAX_BYTES = 64 * 2**20  # of all files
-KERNEL = ".kernel"
+KERNEL = ".kernel"  # a kind of file
 _LOCK = threading.Lock()
 
 
@@ -145,13 +145,13 @@ def folder() -> Path | None:
     return base / "grounded"
 
 
-def stored(digest: str) -> bytes | None:
+def stored(digest: str, kind: str = KERNEL) -> bytes | None:
     """What is stored under a digest, or None when there is nothing that can be trusted."""
     try:
         home = folder()
         if home is None:
             return None
-        path = home / f"{digest}{KERNEL}"
+        path = home / f"{digest}{kind}"
         if not (path.is_file() and _own(home) and _own(path)):
             return None
         data = path.read_bytes()
@@ -165,7 +165,7 @@ def stored(digest: str) -> bytes | None:
         return None
 
 
-def store(digest: str, code: bytes) -> None:
+def store(digest: str, code: bytes, kind: str = KERNEL) -> None:
     """Stores code, atomically; silently does nothing where it can't."""
     import tempfile  # only a cold process needs it
 
@@ -180,7 +180,7 @@ def store(digest: str, code: bytes) -> None:
         try:
             with os.fdopen(handle, "wb") as file:
                 file.write(MAGIC + _check(digest, code) + code)
-            Path(temporary).replace(home / f"{digest}{KERNEL}")
+            Path(temporary).replace(home / f"{digest}{kind}")
         except BaseException:
             with contextlib.suppress(OSError):
                 Path(temporary).unlink()
