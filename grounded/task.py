@@ -264,8 +264,7 @@ class Task:
             GroundedError: if `trial` is not a `Trial`.
         """
         of_type("the trial", trial, Trial)
-        judge = lambda: self._utility(trial.whole(self.horizon))  # noqa: E731
-        return trial.worth(f"{self.hash}{self.model.angles}whole", judge)
+        return self._utility(trial.whole(self.horizon))
 
     def terms(self, trial: Trial) -> dict[str, float]:
         """Return the contribution (<= 0) of each [reward] entry to a trial's utility, by name."""

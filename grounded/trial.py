@@ -8,7 +8,7 @@ that stops one or two steps early is extrapolated to the end of the run (`Trial.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -140,15 +140,6 @@ class Trial:
             settled = calm(self.inputs[: length - 1])
             known[length] = readonly(resampled_noise(self.states[:length], settled))
         return known[length]
-
-    def worth(self, task: str, compute: Callable[[], float]) -> float:
-        """Return the utility in a task; subclasses may cache it.
-
-        Args:
-            task: cache key that identifies everything the utility depends on.
-            compute: computes the utility.
-        """
-        return compute()
 
     def repeats(self, other: Trial) -> bool:
         """Return whether the other trial has exactly the same states, bit for bit."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from typing import Any
@@ -27,14 +26,11 @@ from grounded_cli.console.options import chosen_trials, command, flag, parallel
 from grounded_cli.console.terminal import field, names_in, show, stages, table, tell, tinted
 from grounded_cli.console.workspace_option import next_line, open_workspace
 from grounded_cli.propose import show_extent
-from grounded_trials.wording import figure, percent
+from grounded_trials.wording import percent
 from grounded_trials.workspace.candidates.trust import extent_of
 from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
-from grounded_trials.workspace.home.rivals import Compared
 from grounded_trials.workspace.last_diagnosis import left_out
 from grounded_trials.workspace.next_step import BEFORE_TRIALS
-
-_GROUP = re.compile(r"[tTcC]?\d+(,[tTcC]?\d+)*")
 
 
 @command("diagnose")
@@ -51,7 +47,7 @@ _GROUP = re.compile(r"[tTcC]?\d+(,[tTcC]?\d+)*")
     nargs=2,
     metavar="A B",
     shell_complete=complete.trials,
-    help="Two groups of trials, T1,T2 T3,T4: what changed. Or two models: which predicts better.",
+    help="Two groups of trials, T1,T2 T3,T4: what changed.",
 )
 @partial(parallel, by_itself=True)
 @flag("--instruments", help="Check the sensors only; takes some seconds.")
@@ -70,17 +66,8 @@ def diagnose(
     The verdict is one effect, several, none (the rest is noise, or cannot be told from it) or
     unknown (a gap that no known effect explains). If two effects tie, a probe is written: a
     candidate whose trial would tell them apart.
-
-    --compare also takes two models: a workspace (`.` for this one), a model.py, an MJCF or URDF
-    file, or a YAML file with values. It says which predicts the trials better, where, and which
-    numbers they can't decide.
     """
     workspace = open_workspace()
-    if compare and not all(_GROUP.fullmatch(text) for text in compare):
-        with stages() as stage:
-            compared = workspace.compare(*compare, trials, progress=stage)
-        yield compared
-        return _models(compared)
     first, second = map(names_in, compare or ("", ""))
     if compare and (trials or not (first and second) or {*first} & {*second}):
         raise wrong(
@@ -114,25 +101,6 @@ def diagnose(
     if found.probe:
         show_extent(extent_of(workspace.candidate(found.probe)[0], workspace.task))
     show(f"\n{next_line(found.then)}")
-
-
-def _models(found: Compared) -> None:
-    """Print which of two models to trust."""
-    first, *others = found.findings
-    show(field("trust", first.sentence))
-    for one in others:
-        show(field("open", one.sentence))
-    rows = [
-        (name, *map(figure, one.errors or ()), one.better or "undecided")
-        for name, one in found.where.items()
-    ]
-    show("\n" + table(rows, (f"rms {found.ahead_s:g} s ahead", *found.models, "better")))
-    if found.numbers:
-        told = [
-            (name, *(one.values or ()), one.better or "undecided")
-            for name, one in found.numbers.items()
-        ]
-        show("\n" + table(told, ("number", *found.models, "better")))
 
 
 def _show(found: Diagnosis, inputs: Collection[str] = (), *, details: bool) -> None:

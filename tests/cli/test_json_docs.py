@@ -124,7 +124,6 @@ COMMANDS = [
     ("recover", "{trial}", "-o", "{folder}/saved.mcap"),
     ("explain", "log.unit"),
     ("diagnose", "--instruments"),
-    ("diagnose", "--compare", ".", "{folder}/model.py"),
     ("init", "{folder}/more", "--blank", "--model", "{folder}/model.py"),
     ("next", "{trial}"),
 ]

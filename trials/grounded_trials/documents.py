@@ -36,7 +36,6 @@ from grounded_trials.workspace.candidates.running import Ran
 from grounded_trials.workspace.discarding import SetAside
 from grounded_trials.workspace.exciting import Excited
 from grounded_trials.workspace.home.library import Shelved
-from grounded_trials.workspace.home.rivals import Compared
 from grounded_trials.workspace.home.taking_home import TakenHome
 from grounded_trials.workspace.off_target import OffTarget
 from grounded_trials.workspace.placing import FromStarts
@@ -339,7 +338,7 @@ class InstrumentsJson(TypedDict):
 
 DOCUMENTS: dict[str, Any] = {
     "adopt": Adopted | Undone,
-    "diagnose": Diagnosis | Compared | InstrumentsJson,
+    "diagnose": Diagnosis | InstrumentsJson,
     "discard": SetAside,
     "excite": Excited,
     "explain": ExplainJson,

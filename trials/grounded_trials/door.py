@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.fitting import fit_in
     from grounded_trials.workspace.home.library import begin_with as _begin_with
     from grounded_trials.workspace.home.library import export_actuator as _export_actuator
-    from grounded_trials.workspace.home.rivals import compare_models
     from grounded_trials.workspace.home.taking_home import export_model as _export_model
     from grounded_trials.workspace.inspecting import inspect_in
     from grounded_trials.workspace.intake.ingest import Ingested
@@ -142,7 +141,6 @@ class Workspace(Folder):
         status = status_in
         fit = fit_in
         diagnose = diagnose_in
-        compare = compare_models
         preflight = instruments_in
         adopt = adopt_effects
         undo_adoption = _undo_adoption
@@ -165,7 +163,6 @@ class Workspace(Folder):
         status = _Method("workspace.candidates.proposing.status_in")
         fit = _Method("workspace.fitting.fit_in", writes=True)
         diagnose = _Method("workspace.diagnosing.diagnose_in")
-        compare = _Method("workspace.home.rivals.compare_models")
         preflight = _Method("workspace.diagnosing.instruments_in")
         adopt = _Method("workspace.adoption.adopt_effects", writes=True)
         undo_adoption = _Method("workspace.adoption.undo_adoption", writes=True)

@@ -196,14 +196,4 @@ ENTRIES: dict[str, Entry] = {
         "no run inside the limits would tell {effect} from {others}",
         "[[claimed? adopt {claimed}]][[!claimed? record larger inputs or another manoeuvre]]",
     ),
-    # two models
-    "trusted": Entry(
-        "note",
-        "{better} predicts these trials better: errors of {worse} are {ratio:.3g} times as large",
-    ),
-    "undecided": Entry(
-        "note",
-        "these trials can't decide [[models? between ]]{about}",
-        "[[!models? record runs in which {about:it/they} matter{about:s/}]]",
-    ),
 }

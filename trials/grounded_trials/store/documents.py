@@ -17,9 +17,8 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping, MutableMapping
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -27,9 +26,8 @@ from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.result import MALFORMED, Document
 from grounded_trials.plain_file import open_file, unreadable
-from grounded_trials.store.store import Lost, Store, Stored, made_folder, write_atomically
+from grounded_trials.store.store import Lost, Store, made_folder, write_atomically
 
-Known = Callable[[str, Path, Callable[[], dict[str, Any]]], dict[str, Any]]
 D = TypeVar("D", bound=Document)
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
@@ -166,29 +164,21 @@ class Notes:
         with self.store.adding(text.encode(), ".json", again=again):
             yield
 
-    def read(
-        self, lost: list[Lost] | None = None, known: Known | None = None
-    ) -> Iterator[dict[str, str]]:
+    def read(self, lost: list[Lost] | None = None) -> Iterator[dict[str, str]]:
         """Yield all notes in order of creation.
 
         Args:
             lost: damaged notes are appended to it; None: they raise an error.
-            known: an index's lookup of a file's contents, which reads the file if it is not known.
 
         Raises:
             GroundedError: naming a damaged note, if `lost` is None.
         """
         for entry in self.store.list():
             try:
-                learn = partial(self._of, entry)
-                note = known(entry.path.name, entry.path, learn) if known else learn()
+                note: dict[str, str] = json.loads(self.store.read(entry))
             except GroundedError as error:
                 if lost is None:
                     raise
                 lost.append(Lost(str(entry.path), str(error)))
                 continue
             yield note
-
-    def _of(self, entry: Stored) -> dict[str, str]:
-        note: dict[str, str] = json.loads(self.store.read(entry))
-        return note

@@ -47,9 +47,7 @@ from grounded_trials.workspace.user_files.task_file import build_task, read_targ
 
 if TYPE_CHECKING:
     from grounded_trials.logs.log_table import LogMapping
-    from grounded_trials.store.index import Index
 
-INDEXED_FROM = 200  # from this number of trials on, an index is used
 _ID = re.compile(r"c\d{4,}")
 
 
@@ -157,7 +155,7 @@ class Folder:
     @cached_property
     def noted(self) -> Noted:
         """The notes of the workspace."""
-        return self._read_notes(None)
+        return noted(self.notes.read())
 
     def forget(self) -> Self:
         """Forget everything that was read, since files may have changed; return the folder."""
@@ -263,7 +261,7 @@ class Folder:
         Raises:
             GroundedError: if there is no candidate of that name.
         """
-        for _, read in self._sources(identity):
+        for read in self._sources(identity):
             return read()
         raise unknown_candidate(self, identity)
 
@@ -322,17 +320,15 @@ class Folder:
         if lost is not None and "_trials" in vars(self):  # they were read, and none is damaged
             lost += map(_named, self.noted.gone(self.store))
             return self._trials
-        known, found = self.noted if lost is None else self._read_notes(broken), []
-        read = self._indexed if self._many else self._whole
+        known, found = self.noted if lost is None else noted(self.notes.read(broken)), []
         for stored in self.store.list():
             try:
                 if known.why_aside(stored) is None:
-                    found.append(read(stored))
+                    found.append(self._whole(stored))
             except GroundedError as error:
                 if lost is None:
                     raise
                 broken.append(Lost(str(stored.path), str(error)))
-        self.save_index()
         if lost is not None:
             lost += map(_named, (*broken, *known.gone(self.store)))
         trials = named_apart([*grouped(found, known)], known, self.candidate_path)
@@ -340,47 +336,10 @@ class Folder:
             vars(self)["_trials"] = trials
         return trials
 
-    @property
-    def _many(self) -> bool:
-        return len(self.store.list()) >= INDEXED_FROM
-
-    def _read_notes(self, broken: list[Lost] | None) -> Noted:
-        return noted(self.notes.read(broken, self._index.known if self._many else None))
-
-    def _read_one(self, stored: Stored) -> tuple[Trial, dict[str, str], bytes | None]:
-        """Read a trial as logged, its metadata, and the candidate file attached to it."""
-        trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
-        return replace(trial, id=stored.id), meta, policy
-
     def _whole(self, stored: Stored) -> StoredTrial:
-        trial, meta, policy = self._read_one(stored)
-        ran = sha256(policy) if policy else ""
-        return StoredTrial(stored, interpolate_gaps(trial).trial, meta, trial, ran, lambda: policy)
-
-    @cached_property
-    def _index(self) -> Index:
-        from grounded_trials.store.index import Index
-
-        return Index(self.store.folder)
-
-    @cached_property
-    def _made(self) -> dict[str, StoredTrial]:
-        """The trials that were created from the index, by file name."""
-        return {}
-
-    def _indexed(self, stored: Stored) -> StoredTrial:
-        read = partial(self._read_one, stored)
-        if stored.path.name not in self._made:
-            trial, measured, about = self._index.trial(stored.path, read)
-            self._made[stored.path.name] = StoredTrial(
-                stored, trial, about["meta"], measured, about["ran"], lambda: read()[2]
-            )
-        return self._made[stored.path.name]
-
-    def save_index(self) -> None:
-        """Save the index of the trials for the next command, if it is used."""
-        if "_index" in vars(self):
-            self._index.save()
+        trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
+        trial = replace(trial, id=stored.id)
+        return StoredTrial(stored, interpolate_gaps(trial).trial, meta, trial, policy)
 
     def _read_candidates(
         self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None
@@ -389,9 +348,9 @@ class Folder:
         ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
             why = GroundedError("its file is missing and no trial contains it")
-            for place, read in self._sources(identity, trials):
+            for read in self._sources(identity, trials):
                 try:
-                    found = self._proven(identity, place, read)
+                    found = StoredCandidate.of(read(), identity)
                     trial, known = ran.get(identity, ("", ""))
                     if known and found.sha256 != known:
                         name = f"candidates/{identity}.mcap"
@@ -409,20 +368,6 @@ class Folder:
                     raise unreadable(f"candidates/{identity}.mcap", why)
                 lost.append(Lost(f"{identity}.mcap", str(why)))
 
-    def _proven(
-        self, identity: str, place: Path | None, read: Callable[[], bytes]
-    ) -> StoredCandidate:
-        """Read a candidate from one of its copies; files known to the index are not read again."""
-        if place is None or "_index" not in vars(self):
-            return StoredCandidate.of(read(), identity)
-
-        def whole() -> tuple[Candidate, dict[str, str]]:
-            one = StoredCandidate.of(read(), identity)
-            return one.candidate, {"kind": one.kind, "task": one.task, "sha256": one.sha256}
-
-        candidate, about = self._index.candidate(place, whole)
-        return StoredCandidate(candidate, **about)
-
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:
         ids = {t.trial.candidate for t in trials}
         with suppress(FileNotFoundError), os.scandir(self.folder / "candidates") as entries:
@@ -431,8 +376,11 @@ class Folder:
 
     def _sources(
         self, identity: str, trials: tuple[StoredTrial, ...] | None = None
-    ) -> Iterator[tuple[Path | None, Callable[[], bytes]]]:
-        """Yield the copies of a candidate: its file, then those in the trials that ran it."""
+    ) -> Iterator[Callable[[], bytes]]:
+        """Yield how to read the copies of a candidate: its file, then those in trials that ran it.
+
+        A copy is read when it is asked for: the file may be damaged.
+        """
 
         def own() -> bytes:
             with open_file(path, follow=False) as stream:
@@ -440,7 +388,7 @@ class Folder:
 
         path = self.candidate_path(identity)
         if path.is_file():
-            yield path, own
+            yield own
         for one in self.trials() if trials is None else trials:
-            if one.trial.candidate == identity and (policy := one.policy) is not None:
-                yield None, partial(bytes, policy)
+            if one.trial.candidate == identity and one.policy is not None:
+                yield partial(bytes, one.policy)

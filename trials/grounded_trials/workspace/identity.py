@@ -13,6 +13,7 @@ import json
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -71,13 +72,12 @@ class StoredTrial:
     trial: Trial  # .id is its short name (t0007); short gaps are bridged
     meta: dict[str, str]
     measured: Trial  # as logged, with its gaps
-    ran: str  # SHA-256 of the candidate file that it contains, "" for none
-    policy_of: Callable[[], bytes | None]
+    policy: bytes | None  # the contents of the candidate file that it ran
 
-    @property
-    def policy(self) -> bytes | None:
-        """The contents of the candidate file that it ran."""
-        return self.policy_of() if self.ran else None
+    @cached_property
+    def ran(self) -> str:
+        """SHA-256 of the candidate file that it contains, "" for none."""
+        return sha256(self.policy) if self.policy else ""
 
 
 @dataclass(frozen=True, eq=False)

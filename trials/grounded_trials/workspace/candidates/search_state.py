@@ -54,7 +54,6 @@ def standing_in(
     """
     contents = contents or workspace.read()
     now = standing_of(workspace, contents)
-    workspace.save_index()
     if ahead and now.phase is Phase.PROPOSE and now.incumbent is not None:
         now = planned(workspace, contents).standing
     return answered(workspace, now)
