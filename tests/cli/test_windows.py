@@ -15,10 +15,10 @@ LACKS = {
     "signal": "SIGPROF setitimer",
     "select": "poll",
 }
-SITE = f"""import builtins, filelock, os, psutil, select, signal, subprocess, sys, threading, types
+SITE = f"""import builtins, filelock, os, select, signal, subprocess, sys, threading, types
 whole = types.SimpleNamespace(**vars(os))  # these are other ones there
 for name, module in [*sys.modules.items()]:
-    if name.startswith(("filelock", "psutil")) and hasattr(module, "os"):
+    if name.startswith("filelock") and hasattr(module, "os"):
         module.os = whole
 for module, names in {LACKS!r}.items():
     for name in names.split():
@@ -34,7 +34,6 @@ builtins.__import__ = without
 
 @pytest.fixture
 def grounded(tmp_path):
-    pytest.importorskip("psutil", reason="not needed on Linux")
     (tmp_path / "sitecustomize.py").write_text(SITE)
     path = os.pathsep.join([str(tmp_path), *sys.path])
     strict = {"PYTHONPATH": path, "PYTHONWARNDEFAULTENCODING": "1"}

@@ -77,15 +77,6 @@ def crash() -> None:
     os.kill(os.getpid(), signal.SIGTERM)
 
 
-@pytest.fixture(params=["fork", "spawn"])
-def either(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Start children as on Linux, and as elsewhere."""
-    if request.param == "spawn":
-        pytest.importorskip("psutil", reason="not needed on Linux")
-        monkeypatch.setattr("grounded_trials.within.FORKS", False)
-    return str(request.param)
-
-
 @pytest.mark.parametrize(
     ("function", "setting"),
     [(endless, SECONDS), (in_c, SECONDS), (hungry, MEMORY), (hidden, MEMORY), (full, MEMORY)],
@@ -101,7 +92,7 @@ def test_a_reader_ends_at_each_limit_which_is_named(
     assert not [*tmp_path.iterdir()]
 
 
-def test_results_and_errors_come_back(either: str) -> None:
+def test_results_and_errors_come_back() -> None:
     assert within("a.log", 10**8, echo, np.arange(5), b=[1]).tolist() == [1, 2, 3, 4, 5]
     with pytest.raises(DamagedFile, match="a hole") as damaged:
         within("a.log", 0, broken)
@@ -127,7 +118,7 @@ def test_a_crash_of_a_decoder_is_an_error_that_names_the_file() -> None:
         within("a.log", 0, crash)
 
 
-def test_ctrl_c_ends_the_child_as_well(either: str, tmp_path: Path) -> None:
+def test_ctrl_c_ends_the_child_as_well(tmp_path: Path) -> None:
     note = tmp_path / "pid"
 
     def press(*_: object) -> None:

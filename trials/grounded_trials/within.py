@@ -5,10 +5,9 @@ hundred thousand lists that must be skipped one by one), in our code or in a lib
 it. `within` therefore runs whatever reads a log in a child process that the system ends at a limit,
 so that no loop has to count what it does. The child returns its result, or its exception.
 
-On Linux the child is a copy of this process (a fork): it starts in a few milliseconds, what it is
-given need not be picklable, and the system enforces every limit. Elsewhere a fork is not safe: the
-child is another Python, whose time and memory are looked at every `LOOK_S`. Time is the child's CPU
-time, so a slow disk or a busy machine does not matter.
+The child is a copy of this process (a fork): it starts in a few milliseconds, and what it is given
+need not be picklable. Time is its CPU time, so a slow disk or a busy machine does not matter.
+Forks are safe on Linux alone; elsewhere logs are read in this process, without a budget.
 """
 
 from __future__ import annotations
@@ -18,20 +17,16 @@ import os
 import pickle
 import select
 import signal
-import subprocess
 import sys
 import tempfile
-import threading
-import time
 import traceback
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
 from errno import EFBIG
-from io import BufferedReader
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar
 
 from grounded.checks import wrong
 from grounded.errors import GroundedError
@@ -45,7 +40,6 @@ DEFAULTS = {SECONDS: 3.0, MEMORY: 250.0}  # [s], [MB], for an empty file
 SECONDS_PER_MB, MEMORY_PER_BYTE = 1.0, 8.0  # in addition, for each MB and byte of the file
 DISK = 4  # [memory] largest decompressed file
 PATIENCE = 20  # [CPU time] after which a child that does not end is stuck
-LOOK_S = 0.1  # [s] between two looks at a child's memory
 ENDS = {77: "memory", 78: "disk", -9: "memory", -27: "time"}  # exit codes; SIGKILL, SIGPROF
 FORKS = sys.platform == "linux" and hasattr(os, "fork")
 
@@ -104,151 +98,68 @@ def within(
         GroundedError: for a setting in the environment that is not a positive number, and whatever
             `function` raises.
     """
-    if _inside:
+    if _inside or not FORKS:
         return function(*args, **kwargs)
     limits = _Limits(str(name), size)
     with tempfile.TemporaryDirectory(prefix="grounded-") as room:
-        order = (limits.seconds, limits.memory, room, function, args, kwargs)
+        receive, send = os.pipe()
         try:
-            child = (_Copy if FORKS else _Other)(order)
+            with warnings.catch_warnings():  # of other threads, whose locks no reader takes
+                warnings.simplefilter("ignore", DeprecationWarning)
+                child = os.fork()
         except OSError as error:
             raise unreadable(name, error) from None
-        try:
-            done, value = _answer(child, limits)
-        finally:  # also of Ctrl-C
-            child.end()
+        if not child:
+            try:
+                os.close(receive)
+                gc.freeze()  # else the first collection copies the parent's memory
+                with os.fdopen(send, "wb") as out:
+                    _serve(out, limits, room, lambda: function(*args, **kwargs))
+            finally:
+                os._exit(1)
+        os.close(send)
+        ended: int | None = None
+        with os.fdopen(receive, "rb") as answer:
+            try:
+                found = _answer(answer, limits)
+            finally:  # also of Ctrl-C
+                with suppress(OSError):  # the program that this runs in may have waited
+                    os.kill(child, signal.SIGKILL)  # that changes no exit code of what has ended
+                    ended = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    if found is None:
+        raise limits.over(ENDS.get(ended or 0) or f"crashes (exit code {ended})")
+    done, value = found
     if not done:
         raise value
     result: T = value
     return result
 
 
-class _Copy:
-    """A copy of this process, which the system limits."""
+def _answer(answer: Any, limits: _Limits) -> tuple[bool, Any] | None:
+    """Return what the child sent: whether it succeeded, and its result or exception.
 
-    code: int | None  # its exit code, negative for a signal; None while it may run
-
-    def __init__(self, order: tuple[Any, ...]) -> None:
-        receive, send = os.pipe()
-        with warnings.catch_warnings():  # of other threads, whose locks no reader takes
-            warnings.simplefilter("ignore", DeprecationWarning)
-            self.process = os.fork()
-        if not self.process:
-            try:
-                gc.freeze()  # else the first collection copies the parent's memory
-                os.close(receive)
-                with os.fdopen(send, "wb") as out:
-                    _serve(out, *order)
-            finally:
-                os._exit(1)
-        os.close(send)
-        self.answer, self.code = os.fdopen(receive, "rb"), None
-        self.poll = select.poll()
-        self.poll.register(self.answer, select.POLLIN)
-
-    def answers(self, seconds: float) -> bool:
-        """Wait for its answer, or its end; False if neither came in that time."""
-        return bool(self.poll.poll(1e3 * seconds))
-
-    def over(self, limits: _Limits) -> str:
-        """Return the limit that it exceeds while it runs; the system ends it there."""
-        return ""
-
-    def wait(self) -> int:
-        """Return the exit code, once it has ended; negative for a signal."""
-        if self.code is None:
-            self.code = os.waitstatus_to_exitcode(os.waitpid(self.process, 0)[1])
-        return self.code
-
-    def end(self) -> None:
-        """End it, if it still runs."""
-        self.answer.close()
-        with suppress(ChildProcessError):  # the program that this runs in may have waited
-            if self.code is None:
-                os.kill(self.process, signal.SIGKILL)
-                self.wait()
-
-
-class _Other:
-    """Another Python, at whose time and memory this process looks."""
-
-    def __init__(self, order: tuple[Any, ...]) -> None:
-        code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
-        pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-        # Ctrl-C ends it through its parent
-        self.child = subprocess.Popen([sys.executable, "-c", code], start_new_session=True, **pipes)
-        assert self.child.stdin is not None and self.child.stdout is not None
-        self.answer = cast("BufferedReader", self.child.stdout)
-        with self.child.stdin as stream, suppress(BrokenPipeError):
-            pickle.dump(order, stream)
-        self.waiting = threading.Thread(target=self.answer.peek, args=(1,), daemon=True)
-        self.waiting.start()
-
-    def answers(self, seconds: float) -> bool:
-        """Wait for its answer, or its end; False if neither came in that time."""
-        self.waiting.join(seconds)
-        return not self.waiting.is_alive()
-
-    def over(self, limits: _Limits) -> str:
-        """Return the limit that it exceeds while it runs."""
-        import psutil
-
-        with suppress(psutil.Error):  # it has just ended
-            child = psutil.Process(self.child.pid)
-            used = child.cpu_times()
-            if child.memory_info().rss > limits.memory:
-                return "memory"
-            if used.user + used.system > limits.seconds:
-                return "time"
-        return ""
-
-    def wait(self) -> int:
-        """Return the exit code, once it has ended; negative for a signal."""
-        return self.child.wait()
-
-    def end(self) -> None:
-        """End it, if it still runs."""
-        self.child.kill()
-        self.child.wait()
-        self.waiting.join()
-        self.answer.close()
-
-
-def _answer(child: _Copy | _Other, limits: _Limits) -> tuple[bool, Any]:
-    """Return what the child sent: whether it succeeded, and its result or exception."""
+    None if it ended before, or while it answered.
+    """
     patience = PATIENCE * limits.seconds
-    until = time.monotonic() + patience
-    while not child.answers(patience if FORKS else LOOK_S):
-        if time.monotonic() > until:
-            return False, limits.over(f"does not end within {patience:.0f} s")
-        if over := child.over(limits):
-            return False, limits.over(over)
+    waiting = select.poll()
+    waiting.register(answer, select.POLLIN)
+    if not waiting.poll(1e3 * patience):
+        return False, limits.over(f"does not end within {patience:.0f} s")
     try:
-        found: tuple[bool, Any] = pickle.load(child.answer)
-        return found
-    except (EOFError, pickle.UnpicklingError):  # it ended before, or while it answered
-        code = child.wait()
-        return False, limits.over(ENDS.get(code) or f"crashes (exit code {code})")
+        found: tuple[bool, Any] = pickle.load(answer)
+    except (EOFError, pickle.UnpicklingError):
+        return None
+    return found
 
 
-def main() -> None:
-    """Do what standard input says, in a process that `within` started."""
-    order = pickle.load(sys.stdin.buffer)
-    with os.fdopen(os.dup(1), "wb") as out:
-        os.dup2(2, 1)  # what a library prints is no answer
-        _serve(out, *order)
-
-
-def _serve(
-    out: Any, seconds: float, memory: int, room: str, function: Any, args: Any, kwargs: Any
-) -> None:
+def _serve(out: Any, limits: _Limits, room: str, function: Callable[[], Any]) -> None:
     """Set the limits, call the function, send its result or exception, and end the process."""
     global _inside
     _inside, tempfile.tempdir, code = True, room, 0
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C ends it through its parent
     try:
-        _limit(seconds, memory)
-        pickle.dump((True, function(*args, **kwargs)), out, pickle.HIGHEST_PROTOCOL)
+        _limit(limits.seconds, limits.memory)
+        pickle.dump((True, function()), out, pickle.HIGHEST_PROTOCOL)
         out.flush()
     except BaseException as error:
         code = _cause(error)
@@ -260,18 +171,14 @@ def _serve(
 
 
 def _limit(seconds: float, memory: int) -> None:
-    """Let the system end this process at its limits; of Windows its parent does."""
-    try:
-        import resource
-    except ImportError:
-        return
+    """Let the system end this process at its limits."""
+    import resource  # Windows has none
 
     signal.signal(signal.SIGPROF, signal.SIG_DFL)  # ends it, also inside a library
     signal.setitimer(signal.ITIMER_PROF, seconds)
     limits = {resource.RLIMIT_FSIZE: DISK * memory}
-    if sys.platform == "linux":
-        pages = int(Path("/proc/self/statm").read_text().split()[0])
-        limits[resource.RLIMIT_AS] = pages * resource.getpagesize() + memory
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    limits[resource.RLIMIT_AS] = pages * resource.getpagesize() + memory
     for kind, most in limits.items():
         hard = resource.getrlimit(kind)[1]
         most = most if hard == resource.RLIM_INFINITY else min(most, hard)
