@@ -35,10 +35,8 @@ def status(details: bool) -> Iterator[Status]:
     tell(status.findings, all_=details)
     for name, why in status.discarded.items():
         show(field("discarded", f"{name}{why and ': ' + why}"))
-    if settled := status.settled:
-        show(f"\n{table(settled.rows, ('adopted', 'value'))}")
-        for one in filter(None, (settled.gained, settled.open)):
-            show("\n".join(wrapped(one.sentence, "  ", "  ")))
+    if status.adopted:
+        show(f"\n{table(status.adopted, ('adopted', 'value'))}")
     show(f"\n{next_line(status.then)}")
 
 

@@ -118,5 +118,5 @@ def test_a_fit_in_vain_is_not_asked_for_again(misled):
     claimed(misled, after=0.5)  # which predicts worse, too
     assert misled.status().then.verb not in ("fit", "adopt", "diagnose")
     claimed(misled)
-    (misled.reports / "fit.json").write_text("[")
+    (misled.reports / "adoptions.json").write_text("[")
     assert misled.status().then == NextCommand("fit")

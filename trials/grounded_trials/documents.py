@@ -213,8 +213,6 @@ class AdoptedJson(TypedDict):
     """What was adopted."""
 
     clauses: list[str]
-    gained: str | None
-    left: str | None
 
 
 class ReportJson(TypedDict):

@@ -38,7 +38,7 @@ from grounded_trials.workspace.off_target import (
 )
 
 if TYPE_CHECKING:
-    from grounded_trials.workspace.adoption import Better, Settled
+    from grounded_trials.workspace.adoption import Better
 
 One = TypeVar("One")
 SHOWN = 4  # largest number of rows of improvements
@@ -90,7 +90,7 @@ class Findings:
     then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # changes since the diagnosis
-    settled: Settled | None = None  # what was adopted, and what it gained
+    adopted: tuple[tuple[str, str], ...] = ()  # name and values of what was adopted
     discarded: tuple[str, ...] = ()  # trials that were set aside
     estimated: tuple[str, ...] = ()  # states that no sensor gives in some of these trials
     uncounted: tuple[str, ...] = ()  # trials of another task or a probe, used only as data
@@ -114,8 +114,6 @@ class Findings:
         if self.diagnosis is None:
             return None
         said = told(self.diagnosis)
-        if self.settled is not None and self.settled.closed:
-            return replace(said, lines=(), rows=(), findings=(), next="")
         return replace(said, next="") if self.since.sentence else said
 
     @property
@@ -123,13 +121,9 @@ class Findings:
         """The same as sentences: what was adopted, why the rest is outdated, and the rest."""
         if self.told is None:
             return []
-        first, adopted = list[str](), self.settled
-        if adopted is not None:
-            names = found("model.adopted", *(name for name, _ in adopted.rows))
-            more = (
-                (adopted.gained, adopted.open) if adopted.closed else ()
-            )  # else it says so itself
-            first = [sentence(one) for one in (names, *more) if one]
+        first = list[str]()
+        if self.adopted:
+            first = [sentence(found("model.adopted", *(name for name, _ in self.adopted)))]
         if text := self.since.sentence:
             first.append(f"{begun(text)}.")
         return [*first, *self.told.texts()]

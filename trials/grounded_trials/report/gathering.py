@@ -26,7 +26,7 @@ from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import Lost
-from grounded_trials.workspace.adoption import Better, better_model, settled_in
+from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.candidates.proposing import uncounted, undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -88,7 +88,7 @@ def gather(workspace: Folder) -> Findings:
         then=asked,
         better=better,
         since=since,
-        settled=settled_in(workspace, diagnosis, since),
+        adopted=adopted_rows(workspace, diagnosis),
         discarded=tuple(workspace.discarded()),
         estimated=_estimated(task, contents, {t.id for t in [*shown, *logs]}),
         uncounted=tuple(uncounted(workspace, contents.trials, now)),

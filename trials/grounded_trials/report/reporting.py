@@ -74,10 +74,8 @@ class Report(Result):
             document["verdict"] = verdict | {"sentence": diagnosis.sentence}
             document["outdated"] = findings.since.sentence or None
             document["findings"] = [one.to_json() for one in diagnosis.findings]
-        if (settled := findings.settled) is None:
-            return document | {"adopted": None}
-        gained, left = (one and one.sentence for one in (settled.gained, settled.open))
-        document["adopted"] = {"clauses": settled.adopted, "gained": gained, "left": left}
+        clauses = [f"{name}: {values}" for name, values in findings.adopted]
+        document["adopted"] = {"clauses": clauses} if clauses else None
         return document
 
 

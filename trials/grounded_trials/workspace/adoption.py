@@ -4,8 +4,8 @@ Effects that were fitted together are adopted together, in the order of the fit,
 hold with the parameters that were estimated beside them: those are adopted, too, unless the trials
 do not tell them or a bound cut them.
 
-reports/adoptions.json records [model] before each adoption, so that it can be undone, how sure its
-values are, and which effects were undone: they are not suggested again.
+reports/adoptions.json records [model] before each adoption, so that it can be undone, how sure the
+values are that were adopted or fitted, and which effects were undone: they are not suggested again.
 """
 
 from __future__ import annotations
@@ -13,34 +13,37 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 from grounded.checks import refused, unknown
 from grounded.diagnosis.causes import sign_only
-from grounded.diagnosis.error_report import gain, telling
+from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.parts import Diagnosis, Estimate
-from grounded.diagnosis.telling import errors_line, open_line
 from grounded.effects import param_name
 from grounded.effects.joint import like_a_load
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
+from grounded.fit import Fit
 from grounded.model import Model, all_at_bounds
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
+from grounded.trial import Trial
 from grounded_trials.store.documents import read_as, write_document
+from grounded_trials.store.store import made_folder
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopted import in_order, installed_effects, planner_of, settled
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
-    Since,
+    chosen,
+    ids_of,
     made_from,
     newer_alone,
     read_diagnosis,
     since_diagnosis,
 )
-from grounded_trials.workspace.last_fit import fitted_in_vain, last_fit
 from grounded_trials.workspace.new_target import to_plan
-from grounded_trials.workspace.readings import changed_since, in_time_now, last_again
+from grounded_trials.workspace.readings import changed_since, last_again, taken_out
 from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_in_model
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
@@ -50,7 +53,6 @@ NO_CHANGE = 1e-3  # relative change of a parameter that counts as none
 WRITTEN = 1e-6  # relative difference of a value and what is written of it
 
 Effects = Sequence[Mapping[str, Any]]
-Texts = Mapping[str, tuple[str, ...]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,15 +117,18 @@ def left_behind(diagnosis: Diagnosis) -> dict[str, Estimate]:
 
 
 def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
-    """Return the filters and delays of sensors that a diagnosis found and the model lacks."""
-    task = workspace.config.task
-    if not (task.target and task.feedback):
+    """Return the filters and delays of sensors that a diagnosis found and nothing takes out yet."""
+    task, late = workspace.config.task, diagnosis.late_sensors
+    if not (late and task.target and task.feedback):
         return ()
-    known = {*_names(workspace.config.model.effects), *in_time_now(workspace, diagnosis.preflight)}
-    late = diagnosis.late_sensors.items()
-    return tuple(
-        n for n, own in late if n not in known and max(own.values()) > NEGLIGIBLE_STEP * task.dt
-    )
+    known, gone = _names(workspace.config.model.effects), taken_out(workspace)
+
+    def is_open(name: str, own: Mapping[str, float]) -> bool:
+        in_log = max(gone.get(one, 0.0) for one in name.partition(":")[2].split("+"))
+        least = max(NEGLIGIBLE_STEP * task.dt, 2 * in_log * ("d" in own))
+        return name not in known and max(own.values()) > least
+
+    return tuple(name for name, own in late.items() if is_open(name, own))
 
 
 def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
@@ -145,7 +150,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     # What is new, but what the user has undone; late sensors are adopted with it, or alone.
     table = workspace.config.model
-    new, undone = diagnosis.open(table.effects, table.params), {*adoptions(workspace).undone}
+    new, undone = diagnosis.open(table.effects, table.params), {*_readable(workspace).undone}
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     alone = NextCommand("adopt", late) if late else None
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
@@ -265,15 +270,15 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     nominal = _nominal(workspace, diagnosis)
     own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
     params = dict(model.params) | own
-    earlier = adoptions(workspace).adoptions  # raises before anything is written, as does
+    earlier = kept(workspace).adoptions  # raises before anything is written, as does
     planner_of(workspace.task, adopted)  # a model that can't be built from these effects
 
-    # Write it, and how it can be undone.
+    # Write it, how it can be undone, and how sure the values are.
     set_in_model(workspace.config.file, params if own else None, adopted or None)
-    step = _step(diagnosis, names, own, adopted, calibrated)
     after = {"effects": adopted or _written(model)["effects"], "params": params}
-    step = replace(step, before=_written(model), after=after)
-    write_document(workspace.reports / KEPT, Kept((*earlier, step)).to_json())
+    step = Step(tuple(names), _written(model), after)
+    std = _told_std(diagnosis, names, calibrated)
+    keep(workspace, _with_std(std, own, adopted), adoptions=(*earlier, step))
 
     # What differs from the fit in which the values were found.
     fitted = {*names, *before, *(diagnosis.effects if claimed else ()), *diagnosis.late_sensors}
@@ -295,8 +300,8 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     told = [*_readings(workspace.base_model, named)]
     called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(before.values())}
     for name, e in left.items():
-        kept, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
-        told.append(found("model.not_told", called.get(name, name), kept=kept, value=value))
+        was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
+        told.append(found("model.not_told", called.get(name, name), kept=was, value=value))
     told += [found("model.along", *done.along)] if done.along else []
     instead = [] if claimed else asked[:1]
     beside = [name for name in _names(adopted) if name not in fitted]
@@ -333,8 +338,8 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
     """Return whether the verdict claims all the effects, but for late sensors.
 
     Raises:
-        GroundedError: if one is not in the diagnosis, was adopted since, or is a delay that [log]
-            takes out already; if several are named and some were fitted as alternatives to others.
+        GroundedError: if one is not in the diagnosis, or was adopted since; if several are named
+            and some were fitted as alternatives to others.
     """
     physics = [name for name in names if name not in diagnosis.late_sensors]
     if diagnosis.changed and physics:
@@ -342,13 +347,9 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
     before, own = made_from(diagnosis).effects, [*diagnosis.effects, *_curves(diagnosis)]
     known = {*(row.effect for row in diagnosis.ranking), *own, *diagnosis.late_sensors}
     adopted = {*_names(workspace.config.model.effects)} - {*before}.intersection(known)
-    in_log = in_time_now(workspace, diagnosis.preflight)
     for name in names:
         if name not in known | adopted:
             raise unknown("effect", name, known, "the last diagnosis")
-        if name in in_log:
-            keys = (f"[log.state.{name.partition(':')[2]}] delay_s = {in_log[name]:g}",)
-            raise refused("plan.delay_twice", keys=keys, effects=(name,))
         if name in adopted:
             raise refused("model.not_adoptable", name, why="adopted")
     if diagnosis.no_cause and physics:
@@ -381,19 +382,18 @@ def undo_adoption(workspace: Folder) -> Undone:
     Raises:
         GroundedError: if nothing is left to undo, or [model] was changed since.
     """
-    kept, file, model = adoptions(workspace), workspace.config.file, workspace.config.model
-    if not kept.adoptions:
+    known, file, model = kept(workspace), workspace.config.file, workspace.config.model
+    if not known.adoptions:
         has = ", ".join(_names(model.effects)) or "none"
         raise refused("model.edited", file, effects=has)
-    last = kept.adoptions[-1]
+    last = known.adoptions[-1]
     params, effects = last.before["params"], last.before["effects"]
     if _written(model) != last.after:
         was = as_toml(params, effects)
         had = listed(f"{name} = {value.as_string()}" for name, value in was.items())
         raise refused("model.edited", file, adopted=last.names, had=had)
     set_in_model(file, params=params, effects=effects)
-    left = Kept(kept.adoptions[:-1], (*kept.undone, *last.names))
-    write_document(workspace.reports / KEPT, left.to_json())
+    keep(workspace, adoptions=known.adoptions[:-1], undone=(*known.undone, *last.names))
     return Undone(
         undone=last.names,
         effects=tuple(effects),
@@ -407,39 +407,30 @@ def _written(model: ModelTable) -> dict[str, Any]:
     return {"effects": [dict(e) for e in model.effects], "params": dict(model.params)}
 
 
-# what is kept of it
+# what is kept of the model beside grounded.toml
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Step(Document):
-    """One adoption: [model] before and after it, and what its diagnosis knew."""
+    """One adoption: [model] before and after it."""
 
     names: tuple[str, ...]
-    before: Mapping[str, Any] = field(default_factory=dict)
-    after: Mapping[str, Any] = field(default_factory=dict)
-    known: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values with their std
-    ties: Texts = field(default_factory=dict)  # effects that the trials could not tell from one
-    equivalent: Texts = field(default_factory=dict)  # those of them that no trial can
-    given: Texts = field(default_factory=dict)  # what a value rests on
+    before: Mapping[str, Any]
+    after: Mapping[str, Any]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Kept(Document):
-    """The adoptions that can be undone, oldest first, and effects undone since a diagnosis."""
+    """What is known of the model's values, and of how they were found."""
 
-    adoptions: tuple[Step, ...] = ()
-    undone: tuple[str, ...] = ()
-
-    def of(self, key: str) -> dict[str, tuple[Any, ...]]:
-        """Return what the last adoption of each effect or parameter kept under a key."""
-        kept = dict[str, tuple[Any, ...]]()
-        for step in self.adoptions:
-            kept |= dict.fromkeys((*step.names, *step.known), ()) | dict(getattr(step, key))
-        return {name: each for name, each in kept.items() if each}
+    adoptions: tuple[Step, ...] = ()  # those that can be undone, oldest first
+    undone: tuple[str, ...] = ()  # effects that were undone since the last diagnosis
+    values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # with their std
+    in_vain: str = ""  # the model and the trials of the last fit of all parameters, if it had none
 
 
-def adoptions(workspace: Folder) -> Kept:
-    """Read the adoptions of a workspace.
+def kept(workspace: Folder) -> Kept:
+    """Read what is kept of a workspace's model.
 
     Raises:
         GroundedError: if reports/adoptions.json can't be read.
@@ -447,67 +438,79 @@ def adoptions(workspace: Folder) -> Kept:
     return read_as(workspace.reports / KEPT, Kept, mend="delete") or Kept()
 
 
+def keep(
+    workspace: Folder, values: Mapping[str, tuple[float, ...]] = MappingProxyType({}), **more: Any
+) -> None:
+    """Keep values of the model with their standard deviations, and change other fields of `Kept`.
+
+    Raises:
+        GroundedError: as `kept`, or if it can't be written.
+    """
+    made_folder(workspace.reports)
+    before = kept(workspace)
+    after = replace(before, values={**before.values, **values}, **more)
+    write_document(workspace.reports / KEPT, after.to_json())
+
+
 def _readable(workspace: Folder) -> Kept:
-    """Read the adoptions of a workspace; a damaged file counts as none."""
+    """Read what is kept; a damaged file counts as none."""
     try:
-        return adoptions(workspace)
+        return kept(workspace)
     except GroundedError:
         return Kept()
 
 
 def diagnosed_again(workspace: Folder) -> None:
     """Forget which effects were undone: a newer diagnosis may claim them again."""
-    kept = adoptions(workspace)
-    if kept.undone:
-        write_document(workspace.reports / KEPT, Kept(kept.adoptions).to_json())
+    if kept(workspace).undone:
+        keep(workspace, undone=())
 
 
-def _step(
-    diagnosis: Diagnosis,
-    names: Sequence[str],
-    own: Mapping[str, float],
-    effects: Effects,
-    calibrated: Mapping[str, Estimate],
-) -> Step:
-    """Return what is kept of the diagnosis from which effects and parameters are adopted."""
+def keep_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
+    """Keep of which model and trials a fit of all parameters predicts no better."""
+    vain = "" if found.helps else _fit_of(workspace, ids_of(used))
+    if vain != _readable(workspace).in_vain:
+        keep(workspace, in_vain=vain)
+
+
+def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
+    """Return whether the current model was already fitted to the same trials without a gain.
+
+    Args:
+        workspace: the workspace.
+        trials: short names; empty: all usable trials.
+    """
+    vain = _readable(workspace).in_vain
+    if not vain.startswith(workspace.planner.fingerprint):
+        return False
+    try:
+        return vain == _fit_of(workspace, ids_of(chosen(workspace, trials).trials))
+    except GroundedError:  # then fit again
+        return False
+
+
+def _fit_of(workspace: Folder, trials: Sequence[str]) -> str:
+    return " ".join([workspace.planner.fingerprint, *trials])
+
+
+def _told_std(
+    diagnosis: Diagnosis, names: Sequence[str], calibrated: Mapping[str, Estimate]
+) -> dict[str, float]:
+    """Return the standard deviations of the values that are adopted, by parameter name."""
     std = {name: e.std for name, e in calibrated.items()}
     for row in (row for row in diagnosis.ranking if row.effect in names):
         family, _, target = row.effect.partition(":")
-        own_name = family == "parameter"
         for q, e in row.params.items():
-            std[target if own_name else param_name(row.effect, q)] = e.std
+            std[target if family == "parameter" else param_name(row.effect, q)] = e.std
+    return std
+
+
+def _with_std(
+    std: Mapping[str, float], own: Mapping[str, float], effects: Effects
+) -> dict[str, tuple[float, float]]:
+    """Return values that are written to [model] with their standard deviations, where known."""
     now = {**own, **{name: value for _, _, name, value in _numbers(effects)}}
-    ties = {name: _beside(diagnosis.indistinguishable, name) for name in names}
-    return Step(
-        tuple(names),
-        known={name: (now[name], s) for name, s in std.items() if name in now and math.isfinite(s)},
-        ties=ties,
-        equivalent={name: _beside(diagnosis.equivalent, name) for name in ties},
-        given={name: on for name, on in diagnosis.conditions.items() if name in {*names, *own}},
-    )
-
-
-def _beside(groups: Sequence[Sequence[str]], name: str) -> tuple[str, ...]:
-    """Return the other effects of the groups that an effect is in."""
-    others = (other for group in groups if name in group for other in group if other != name)
-    return tuple(dict.fromkeys(others))
-
-
-def tied_when_adopted(workspace: Folder) -> dict[str, tuple[str, ...]]:
-    """Return the effects that the trials could not tell from an adopted one, by its name.
-
-    Nothing compares them again, so a tie lasts as long as the one is part of the model and the
-    other is not.
-    """
-    names, ties = _names(workspace.config.model.effects), _readable(workspace).of("ties")
-    rest = {name: tuple(o for o in ties.get(name, ()) if o not in names) for name in names}
-    return {name: others for name, others in rest.items() if others}
-
-
-def equivalent_when_adopted(workspace: Folder) -> set[str]:
-    """Return the adopted effects whose ties (`tied_when_adopted`) no trial can tell from them."""
-    same, ties = _readable(workspace).of("equivalent"), tied_when_adopted(workspace).items()
-    return {name for name, others in ties if {*others} <= {*same.get(name, ())}}
+    return {name: (now[name], s) for name, s in std.items() if name in now and math.isfinite(s)}
 
 
 # the model as it is now
@@ -536,14 +539,13 @@ def numbers_in(workspace: Folder) -> dict[str, tuple[float, str]]:
 def known_values(workspace: Folder, diagnosis: Diagnosis | None = None) -> dict[str, Estimate]:
     """Return the values of parameters and adopted effects, by parameter name, with their +-.
 
-    The +- is that of the diagnosis, of the adoption or of the last fit, the first that has this
-    value; NaN if none has.
+    The +- is that of the diagnosis, or of the adoption or fit that wrote this value; else NaN.
     """
     own = dict(diagnosis.parameters) if diagnosis else {}
     for row in diagnosis.ranking if diagnosis else ():
         own |= {param_name(row.effect, q): e for q, e in row.params.items()}
     fitted = {name: (e.value, e.std) for name, e in own.items()}
-    sources = (fitted, _readable(workspace).of("known"), last_fit(workspace).known)
+    sources = (fitted, _readable(workspace).values)
     now = {name: (one.value, one.unit) for name, one in workspace.base_model.params.items()}
     for effect, q, name, value in _numbers(workspace.config.model.effects):
         now[name] = float(value), units_of(workspace, effect)[q]
@@ -587,93 +589,18 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     return Better(workspace.planner, "with adopted effects") if table.effects else None
 
 
-@dataclass(frozen=True)
-class Settled:
-    """What was adopted, and the prediction errors that a diagnosis measured of the model now.
+def adopted_rows(workspace: Folder, diagnosis: Diagnosis | None) -> tuple[tuple[str, str], ...]:
+    """Return name and values of each adopted effect, then of each changed parameter.
 
-    `closed`: everything that the last diagnosis claims has been adopted. `open`: what is still
-    open, if the diagnosis says so of the model now.
+    That is how a workspace's model differs from model.py.
     """
-
-    rows: tuple[tuple[str, str], ...]  # name and values of each effect and parameter
-    closed: bool = False
-    gained: Finding | None = None
-    open: Finding | None = None
-
-    @property
-    def adopted(self) -> tuple[str, ...]:
-        """Name and values in one text each."""
-        return tuple(f"{name}: {values}" for name, values in self.rows)
-
-
-def settled_in(workspace: Folder, diagnosis: Diagnosis | None, since: Since) -> Settled | None:
-    """Return how a workspace's model differs from model.py; None if it does not.
-
-    The gain is the one that the last diagnosis measured, if it was made with this model or claims
-    what was adopted since; else none is told.
-
-    Args:
-        workspace: the workspace, whose grounded.toml lists what was adopted.
-        diagnosis: the last diagnosis.
-        since: changes since then.
-    """
-    rows = tuple(_rows(workspace, diagnosis))
-    if not rows or diagnosis is None or diagnosis.no_cause:
-        return Settled(rows) if rows else None
-    left = next(open_line(diagnosis), None) if diagnosis.leftover else None
-    if not since.changed:
-        return Settled(rows, gained=_errors(diagnosis, "crude", "outset"), open=left)
-    if not _as_claimed(diagnosis, workspace.config.model):
-        return Settled(rows)
-    gained = _errors(diagnosis, "with_effects", "outset")
-    gained = gained or _errors(diagnosis, "with_effects", "crude")
-    return Settled(rows, closed=True, gained=gained, open=left)
-
-
-def _errors(diagnosis: Diagnosis, now: str, before: str) -> Finding | None:
-    """Return how far predictions are off, and were; None if one of them is not known."""
-    row = telling(diagnosis.prediction_error)
-    if row is None or not (getattr(row, now) and getattr(row, before)):
-        return None
-    return next(errors_line(diagnosis, now, before), None)
-
-
-def _as_claimed(diagnosis: Diagnosis, table: ModelTable) -> bool:
-    """Return whether the model is the one that the diagnosis claims, with everything adopted.
-
-    Late sensors that it found may be adopted or not.
-    """
-    if left_behind(diagnosis) or not diagnosis.effects:
-        return False
-    made, now = made_from(diagnosis), {str(e["name"]): dict(e) for e in table.effects}
-    both = [*diagnosis.effects, *(name for name in diagnosis.late_sensors if name in now)]
-    try:
-        known = diagnosis.adoptable
-        own, effects = joined(diagnosis, both, made.adopted, made.nominal, known)
-    except (GroundedError, KeyError):  # a document of an older version
-        return False
-    wanted = {str(effect["name"]): effect for effect in effects}
-    return now == wanted and dict(made.params or {}) | own == dict(table.params)
-
-
-def _rows(workspace: Folder, diagnosis: Diagnosis | None) -> Iterator[tuple[str, str]]:
-    """Yield the name and the values of each adopted effect, then of each adopted parameter."""
-    table, model, kept = workspace.config.model, workspace.origin.model, _readable(workspace)
-    known, adopted, rests = known_values(workspace, diagnosis), kept.of("known"), kept.of("given")
-    ties = tied_when_adopted(workspace)
-
-    def given(name: str) -> str:
-        text = "".join(f", or {other}" for other in ties.get(name, ()))
-        value = table.params.get(name)
-        fitted = value is not None and not _same(adopted.get(name, (math.inf,))[0], value)
-        on = () if fitted else rests.get(name, ())
-        return text + f", given {listed(on)}" * bool(on)
-
-    for name in _names(table.effects):
-        units = units_of(workspace, name)
-        numbers = [(q, one) for effect, q, one, _ in _numbers(table.effects) if effect == name]
-        each = (f"{q} = {known[one].text}" for q, one in numbers if q in units)
-        yield name, f"{', '.join(each)}{given(name)}"
-    for name, param in model.params.items():
+    table, found = workspace.config.model, list[tuple[str, str]]()
+    known = known_values(workspace, diagnosis) if table.effects or table.params else {}
+    for effect in table.effects:
+        name = str(effect["name"])
+        numbers = ((q, param_name(name, q)) for q in effect if q != "name")
+        found.append((name, ", ".join(f"{q} = {known[one].text}" for q, one in numbers)))
+    for name, param in workspace.origin.model.params.items() if table.params else ():
         if table.params.get(name, param.value) != param.value:
-            yield name, f"{known[name].text}{given(name)}, was {number(param.value)}"
+            found.append((name, f"{known[name].text}, was {number(param.value)}"))
+    return tuple(found)

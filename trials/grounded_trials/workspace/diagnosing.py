@@ -19,7 +19,7 @@ from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
 from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, Weight
+from grounded.findings import Finding, Quantity
 from grounded.findings import found as finding
 from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate
@@ -28,11 +28,7 @@ from grounded.search.safety import objections, spread
 from grounded.search.standing import LOST
 from grounded.share import Share
 from grounded_trials.workspace.adopted import installed_effects
-from grounded_trials.workspace.adoption import (
-    diagnosed_again,
-    equivalent_when_adopted,
-    tied_when_adopted,
-)
+from grounded_trials.workspace.adoption import diagnosed_again
 from grounded_trials.workspace.candidates.handover import outside_limits
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
@@ -41,12 +37,12 @@ from grounded_trials.workspace.candidates.search_state import (
 )
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import (
+    chosen,
     diagnosable,
     made_from,
     model_print,
     write_diagnosis,
 )
-from grounded_trials.workspace.last_fit import chosen
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
     EXPORT,
@@ -137,7 +133,7 @@ def diagnose_in(
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(found.ranking, made.rows_s)
-    more = (*told, *_not_compared(workspace), *_declared(planner.plan, found), *found.findings)
+    more = (*told, *_declared(planner.plan, found), *found.findings)
     found = replace(found, made=made, preflight=seen, ranking=known, findings=more)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
@@ -188,14 +184,6 @@ def _with_next(
 def _left_open(found: Diagnosis) -> bool:
     """Return whether a diagnosis leaves something that noise is not known to explain."""
     return found.kind != "none" or bool(open_noise(found.prediction_error))
-
-
-def _not_compared(workspace: Folder) -> Iterator[Finding]:
-    """Yield a finding for each adopted effect that tied with others when it was adopted."""
-    same = equivalent_when_adopted(workspace)
-    for name, others in tied_when_adopted(workspace).items():
-        code = "gap.equivalent" if name in same else "gap.tie"
-        yield finding(code, name, effect=name, others=others, weight=Weight.NOTE)
 
 
 def _declared(task: Task, found: Diagnosis) -> Iterator[Finding]:

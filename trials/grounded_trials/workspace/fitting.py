@@ -1,8 +1,6 @@
 """Fit in a workspace: choose the trials and write the result to grounded.toml.
 
 Trials and model are those that `diagnose` takes, adopted effects included.
-reports/fit.json records the trials and the model of the last fit of all parameters, and whether it
-predicts better, so that a fit without effect is not suggested again.
 """
 
 from __future__ import annotations
@@ -22,11 +20,10 @@ from grounded.findings import found as finding
 from grounded.fit import fit
 from grounded.result import Result
 from grounded_trials.workspace.adopted import settled
-from grounded_trials.workspace.adoption import not_adopted
+from grounded_trials.workspace.adoption import keep, keep_fit, not_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import readable_diagnosis
-from grounded_trials.workspace.last_fit import chosen, ids_of, write_fit
+from grounded_trials.workspace.last_diagnosis import chosen, ids_of, readable_diagnosis
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.readings import one_message
@@ -126,7 +123,7 @@ def fit_in(
     seen = where_to_mend(workspace, used, found.preflight)
     kept = () if names or latency else _taken_as_exact(workspace, found)
     if not (names or latency):
-        write_fit(workspace, used, found)
+        keep_fit(workspace, used, found)
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
@@ -220,3 +217,5 @@ def apply_fit(workspace: Folder, found: Fit) -> None:
         params=dict(table.params) | own,
         effects=effects if table.effects else None,
     )
+    known = {n: (value, std) for n, value in values.items() if (std := found.params[n].std) >= 0}
+    keep(workspace, known)

@@ -10,6 +10,8 @@ verdict refers to the model and the trials of its time; effects adopted since ar
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,10 +21,11 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.search.planner import model_fingerprint
+from grounded.share import Share, share_of
 from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.identity import named_trials, sha256
 from grounded_trials.workspace.readings import changed_since
 
 if TYPE_CHECKING:
@@ -80,6 +83,35 @@ def usable_ids(workspace: Folder) -> list[str]:
     """Return the ids of the undamaged trials that a diagnosis can use, in order of arrival."""
     logs = [one.measured for one in workspace.whole_trials()]
     return [log.id for log in logs if workspace.fits(log) and log.known_steps >= LEAST_STEPS]
+
+
+def ids_of(trials: Sequence[Trial]) -> tuple[str, ...]:
+    """Return the short names of trials."""
+    return tuple(trial.id for trial in trials)
+
+
+def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
+    """Return the trials to fit or to diagnose, or a share of them.
+
+    States that were filled in by a smoother are no evidence: NaN again.
+
+    Args:
+        workspace: the workspace.
+        names: short names of the trials; empty: all usable ones.
+
+    Raises:
+        GroundedError: if there is none, or one of those named can't be used.
+    """
+    used = diagnosable(workspace)
+    names = named_trials(workspace, names, ids_of(used))
+    share = share_of([trial for trial in used if not names or trial.id in names])
+    guessed = {t.stored.id: t.meta.get("estimated", "").split(",") for t in workspace.trials()}
+    measured: list[Trial] = []
+    for trial in share.trials:
+        states = trial.states.copy()
+        states[:, [name in guessed[trial.id] for name in trial.state_names]] = math.nan
+        measured.append(replace(trial, states=states))
+    return replace(share, trials=measured)
 
 
 def left_out(workspace: Folder) -> list[Finding]:

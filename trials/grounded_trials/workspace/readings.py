@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.accounts.finding import SENSOR_DELAY, Finding, late_effects
+from grounded.accounts.finding import SENSOR_DELAY
 from grounded.errors import NextCommand
 from grounded.findings import Finding as Said
 from grounded.findings import found as said
@@ -174,40 +174,23 @@ def _log_of(workspace: Folder, meta: Mapping[str, str]) -> str:
 # delays that [log] takes out as well as the model
 
 
-def in_time_now(workspace: Folder, findings: Sequence[Finding]) -> dict[str, float]:
-    """Return the delays found by a diagnosis that [log] now removes, by effect name [s].
+def taken_out(workspace: Folder) -> dict[str, float]:
+    """Return the delay of each signal [s] that [log] takes out beyond what it did for the trials.
 
-    Args:
-        workspace: the workspace with the current [log].
-        findings: the findings of the diagnosis, with the whole key of [log].
+    A delay_s that the trials were read with is another part of the delay.
     """
-    late = [one for one in findings if one.kind == "delay" and "delay_s" in one.keys]
-    log = readings(workspace.log_mapping) if late else {}
-    now = [log.get(one.signal, UNCHANGED).delay_s for one in late]
-    # the trial was read with the whole delay less what was found
-    gone = ((one, d) for one, d in zip(late, now, strict=True) if d > _most(one))
-    return {name: d for one, d in gone for name in late_effects([one])}
-
-
-def _most(one: Finding) -> float:
-    """Return the delay_s in [log] above which a delay that was found counts as removed."""
-    return float(one.keys["delay_s"]) - one.delay_s / 2
+    log = readings(workspace.log_mapping)
+    metas = [one.meta for one in workspace.whole_trials() if READ_BY in one.meta] if log else []
+    before = readings_of(metas[-1]) if metas else {}
+    return {n: one.delay_s - before.get(n, UNCHANGED).delay_s for n, one in log.items()}
 
 
 def twice_in_time(workspace: Folder) -> Said | None:
-    """Return that [log] now removes delays that adopted effects have in the model as well.
-
-    A delay_s that trials were read with before the adoption is another part of the delay.
-    """
+    """Return that [log] now removes delays that adopted effects have in the model as well."""
     named = {str(one["name"]): float(one.get("d", 0.0)) for one in workspace.config.model.effects}
     late = {n.removeprefix(SENSOR_DELAY): d for n, d in named.items() if SENSOR_DELAY in n}
-    if not late:
-        return None
-    log = readings(workspace.log_mapping)
-    metas = [one.meta for one in workspace.whole_trials() if READ_BY in one.meta]
-    before = readings_of(metas[-1]) if metas else {}
-    more = {n: log[n].delay_s - before.get(n, UNCHANGED).delay_s for n in late if n in log}
-    twice = [name for name, by in more.items() if by > late[name] / 2 > 0]
+    gone = taken_out(workspace) if late else {}
+    twice = [name for name, d in late.items() if gone.get(name, 0.0) > d / 2 > 0]
     if not twice:
         return None
     keys = tuple(f"[log.state.{name}] delay_s" for name in twice)

@@ -158,11 +158,10 @@ def _why(findings: Findings) -> dict[str, Any]:
     diagnosis, said = findings.diagnosis, findings.told
     if diagnosis is None or said is None:
         return {}
-    adopted = [] if findings.settled is None else findings.settled.rows
     return {
         "kind": diagnosis.kind,
         "verdict": findings.lines,
-        "adopted": adopted if len(adopted) > 1 else [],
+        "adopted": findings.adopted if len(findings.adopted) > 1 else [],
         "causes": said.rows,
         "header": said.header,
         "preflight": instrument_lines(diagnosis.preflight),

@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
-    from grounded_trials.workspace.adoption import Settled
     from grounded_trials.workspace.identity import StoredTrial
 
 
@@ -113,7 +112,7 @@ class Status(Result):
     off_target: tuple[OffTarget, ...] = ()  # errors of the best candidate's runs, in units
     diagnosis: Diagnosis | None = None  # the last one; None if there is none or it is damaged
     since: Since | None = None  # what changed since the diagnosis
-    settled: Settled | None = None  # what was adopted, and what it gained; None if nothing was
+    adopted: tuple[tuple[str, str], ...] = ()  # name and values of what was adopted
     noise: float | None = None  # how much of the best's cost is sensor noise, if it is much
 
     @property
@@ -338,7 +337,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         off_target_of(workspace.task, best.trials if best else ()),
         last,
         here.since if last else None,
-        _settled(workspace, last, here.since),
+        _adopted(workspace, last),
         much_noise(best.noise_cost, best.utility) if best else None,
     )
 
@@ -349,13 +348,13 @@ def _lacks(workspace: Folder, diagnosis: Diagnosis) -> Finding | None:
     return not_adopted(workspace, diagnosis)
 
 
-def _settled(workspace: Folder, last: Diagnosis | None, since: Since) -> Settled | None:
-    """Return what was adopted; None, and without slow imports, if nothing was."""
+def _adopted(workspace: Folder, last: Diagnosis | None) -> tuple[tuple[str, str], ...]:
+    """Return what was adopted, without slow imports if nothing was."""
     if not (workspace.config.model.effects or workspace.config.model.params):
-        return None
-    from grounded_trials.workspace.adoption import settled_in
+        return ()
+    from grounded_trials.workspace.adoption import adopted_rows
 
-    return settled_in(workspace, last, since)
+    return adopted_rows(workspace, last)
 
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:
