@@ -1,7 +1,6 @@
-"""Time the reading of a million nav_msgs/Odometry messages, beside message-by-message decoders.
+"""Time the reading of a million nav_msgs/Odometry messages.
 
-Run by hand: python benchmarks/million_messages.py [COUNT]. Peers are optional (rosbags,
-mcap-ros2-support); they read a twentieth of the messages and are scaled up.
+Run by hand: python benchmarks/million_messages.py [COUNT].
 """
 
 from __future__ import annotations
@@ -12,7 +11,6 @@ import tempfile
 from pathlib import Path
 
 from helpers import fastest
-from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from grounded_trials.formats.bags import standard_types
@@ -44,23 +42,6 @@ def write(path: Path, count: int, *, chunked: bool) -> None:
         writer.finish()
 
 
-def one_by_one(path: Path) -> None:
-    """Read with the decoder of the mcap project."""
-    from mcap_ros2.decoder import DecoderFactory
-
-    with path.open("rb") as stream:
-        for m in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
-            _ = m.decoded_message.pose.pose.position.x
-
-
-def with_rosbags(path: Path) -> None:
-    """Read with the rosbags package."""
-    store = standard_types()
-    with path.open("rb") as stream:
-        for _, _, message in make_reader(stream).iter_messages():
-            _ = store.deserialize_cdr(message.data, KIND).pose.pose.position.x
-
-
 def main() -> None:
     """Print a line for each reader."""
     count = int(sys.argv[1]) if len(sys.argv) > 1 else 1_000_000
@@ -73,13 +54,6 @@ def main() -> None:
             size = path.stat().st_size / 1e6
             how = "zstd chunks" if chunked else "no chunks"
             print(f"{count} messages, {how}, {size:.0f} MB: 4 signals in {took:.2f} s")
-        write(path, count // 20, chunked=True)
-        for name, run in (("mcap-ros2-support", one_by_one), ("rosbags", with_rosbags)):
-            try:
-                took = 20 * fastest(lambda run=run, path=path: run(path), 1)  # type: ignore[misc]
-            except ImportError:
-                continue
-            print(f"{name}, one by one: {took:.1f} s (scaled)")
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from benchmarks.foreign.setups import Setup
 from grounded.compile import DescentOptions
@@ -28,7 +29,7 @@ from grounded.trial import Trial
 
 FILE = Path(__file__).with_name("optima.json")
 SHIFT = 1e-4  # of the range of an input: the step of the differences
-ROUNDS = 25
+ROUNDS, GAIN = 25, 5e-5  # at most; least relative gain of one
 STARTS = 20
 LOST = 1e3  # residual of every step after a run has ended early
 
@@ -97,33 +98,20 @@ def narrowed(setup: Setup, solved: ddp.Result) -> Policy:
 
 
 def polish(setup: Setup, policy: Policy) -> tuple[Policy, float]:
-    """Improve the feed-forward by Gauss-Newton (Levenberg-Marquardt) on the robot's runs."""
-    task = setup.task
-    v = np.array(policy.feedforward)
-    best = task.utility(setup.real(policy, 0))
+    """Improve the feed-forward by Gauss-Newton on the robot's runs."""
+    task, first = setup.task, np.array(policy.feedforward)
     span = np.where(np.isfinite(task.high - task.low), task.high - task.low, 1.0)
-    scale = np.tile(span, len(v))
-    mu = 1e-3
-    for _ in range(ROUNDS):
-        r = residual(setup, policy, v)
-        J = np.empty((len(r), v.size))
-        for i in range(v.size):
-            moved = v.ravel().copy()
-            moved[i] += SHIFT * scale[i]
-            J[:, i] = (residual(setup, policy, moved.reshape(v.shape)) - r) / SHIFT
-        A, g = J.T @ J, J.T @ r  # in units of the ranges
-        before = best
-        for _ in range(8):
-            step = -np.linalg.solve(A + mu * np.diag(np.diag(A) + 1e-9 * A.max()), g)
-            moved = v + (scale * step).reshape(v.shape)
-            utility = task.utility(setup.real(replace(policy, feedforward=moved), 0))
-            if utility > best:
-                v, best, mu = moved, utility, max(mu / 10, 1e-9)
-                break
-            mu *= 5
-        if best - before <= 2e-4 * abs(best):
-            break
-    return replace(policy, feedforward=v), best
+
+    def sent(w: np.ndarray) -> np.ndarray:  # w is about 1, so that relative steps are of the ranges
+        return first + span * (w.reshape(first.shape) - 1.0)
+
+    def missed(w: np.ndarray) -> np.ndarray:
+        return residual(setup, policy, sent(w))
+
+    found = least_squares(missed, np.ones(first.size), diff_step=SHIFT, ftol=GAIN, max_nfev=ROUNDS)
+    better = replace(policy, feedforward=sent(found.x))
+    utilities = [task.utility(setup.real(one, 0)) for one in (policy, better)]
+    return (better if utilities[1] > utilities[0] else policy), max(utilities)
 
 
 def residual(setup: Setup, policy: Policy, v: np.ndarray) -> np.ndarray:
