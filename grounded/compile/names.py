@@ -48,13 +48,10 @@ class Named(Mapping[str, Any]):
 
     def __setattr__(self, name: str, value: Any) -> None:
         what = self.__dict__[" what"]
-        raise refused(
-            "model.name_only", line_of(sys._getframe(1)), what=what, name=name, assigned=True
-        )
+        raise refused("model.name_only", line_of(sys._getframe(1)), what=what, name=name)
 
     def __iter__(self) -> Iterator[str]:
-        what = self.__dict__[" what"]
-        return (Name(name, what) for name in self.__dict__ if name != " what")
+        return (name for name in self.__dict__ if name != " what")
 
     def __len__(self) -> int:
         return len(self.__dict__) - 1
@@ -69,37 +66,6 @@ class Named(Mapping[str, Any]):
                 f"{line_of(frame)}: a {what}", name, must="named", like=f"s.{next(iter(self))}"
             )
         return unknown(what, name, [*self], where=line_of(frame))
-
-
-class Name(str):
-    """A name obtained by iterating over `Named`, which refuses to be taken for the value.
-
-    `x, v = s` unpacks names, as with a dict; arithmetic with them would fail far from the slip, or,
-    as `2 * x`, not at all.
-    """
-
-    what: str  # state, input or parameter
-
-    def __new__(cls, name: str, what: str = "value") -> Name:
-        """Return a name that knows what it names."""
-        self = super().__new__(cls, name)
-        self.what = what
-        return self
-
-    def _slip(self, frame: FrameType) -> GroundedError:
-        return refused("model.name_only", line_of(frame), name=str(self), what=self.what)
-
-    def _refuse(self, *_: Any, **__: Any) -> Any:
-        raise self._slip(sys._getframe(1))
-
-    __array_ufunc__ = __sub__ = __rsub__ = __truediv__ = __rtruediv__ = __pow__ = __rpow__ = _refuse
-    __mul__ = __rmul__ = __neg__ = __abs__ = __radd__ = __float__ = _refuse
-
-    def __add__(self, other: Any) -> str:
-        """Join two strings; refuse numbers."""
-        if isinstance(other, str):
-            return super().__add__(other)
-        raise self._slip(sys._getframe(1))
 
 
 def line_of(frame: FrameType) -> str:

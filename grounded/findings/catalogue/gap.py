@@ -39,7 +39,6 @@ ENTRIES: dict[str, Entry] = {
         "[[, {part:%} of it in {trial} from {start:.3g} to {end:.3g} s]]"
         "[[; {others:more state} {others:is/are} off]]",
     ),
-    "declared": Entry("note", "{effect}: as if {parameter} were {value}, not {was}"),
     "where": Entry(
         "note",
         "the gap is {share:%} in {state}[[ and {share2:%} in {state2}]]"

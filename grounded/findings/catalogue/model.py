@@ -145,10 +145,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "name_only": Entry(
         "refuse",
-        "{about}: '{name}' names one of the {what}s[[assigned? , which can't be assigned to]]"
-        "[[!assigned?  and is not its value]]",
-        "[[assigned? use a local variable]][[!assigned? write s.{name} for a function f(s, ...), "
-        "or unpack s.values()]]",
+        "{about}: '{name}' names one of the {what}s, which can't be assigned to",
+        "use a local variable",
     ),
     "returns": Entry(
         "refuse",

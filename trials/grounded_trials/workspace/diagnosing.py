@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -17,9 +17,8 @@ from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.error_report import gain, open_noise
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
-from grounded.effects.declared import ABSOLUTE, RELATIVE, declared
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity
+from grounded.findings import Finding
 from grounded.findings import found as finding
 from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate
@@ -133,7 +132,7 @@ def diagnose_in(
     measured = found.preflight
     seen = where_to_mend(workspace, used + others, measured)
     known = _as_known(found.ranking, made.rows_s)
-    more = (*told, *_declared(planner.plan, found), *found.findings)
+    more = (*told, *found.findings)
     found = replace(found, made=made, preflight=seen, ranking=known, findings=more)
     write_diagnosis(workspace.reports, found)
     diagnosed_again(workspace)
@@ -184,21 +183,6 @@ def _with_next(
 def _left_open(found: Diagnosis) -> bool:
     """Return whether a diagnosis leaves something that noise is not known to explain."""
     return found.kind != "none" or bool(open_noise(found.prediction_error))
-
-
-def _declared(task: Task, found: Diagnosis) -> Iterator[Finding]:
-    """Yield a finding for each claimed effect that is another value of a constant of the model."""
-    for name in found.effects:
-        row, quantity = found.ranked(name), (RELATIVE | ABSOLUTE).get(name.partition(":")[0])
-        if row is None or quantity is None or row.params[quantity].value is None:
-            continue
-        size = row.params[quantity]
-        for one in declared(task.model, name, size.value, size.std, task.low, task.high):
-            unit = task.model.params[one.parameter].unit
-            value = Quantity(one.value, unit, one.std)
-            was = Quantity(one.was, unit)
-            p = one.parameter
-            yield finding("gap.declared", name, p, effect=name, parameter=p, value=value, was=was)
 
 
 def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
