@@ -33,7 +33,7 @@ from grounded.effects import (
     wrap,
 )
 from grounded.effects.medium import FAMILIES as MEDIUM
-from grounded.figures.figure import Curve, Figure, Panel
+from grounded.figures.figure import Figure, curve, panel
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car
@@ -151,9 +151,9 @@ def picture(kind: str, named: Mapping[str, Drawn]) -> Image.Image:
     times = np.arange(STEPS + 1) * DT
     panels = []
     for name, (state, plain, changed) in named.items():
-        curves = (Curve(times, plain, "other"), Curve(times, changed, "model"))
-        panels.append(Panel(f"{name} ({state})", "", "", curves, kind="time"))
-    figure = Figure(f"effects-{kind}", "", "", tuple(panels))
+        curves = (curve(times, plain, "other"), curve(times, changed, "model"))
+        panels.append(panel(f"{name} ({state})", "", "", curves, kind="time"))
+    figure = Figure(f"effects-{kind}", "", "", panels)
     whole = Image.open(io.BytesIO(png(figure, columns=4, size=(2.6, 1.5)))).convert("RGB")
     return whole.resize((whole.width // 2, whole.height // 2), Image.Resampling.LANCZOS).quantize(
         24

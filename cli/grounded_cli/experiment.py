@@ -13,7 +13,6 @@ from grounded.experiments import car, flight, footnote9, theorem1
 from grounded.refusals import wrong
 from grounded_cli.console.options import command, misuse, parallel
 from grounded_cli.console.terminal import bar, show, table
-from grounded_trials.report.study_pictures import draw_study
 from grounded_trials.store.documents import StudyStore
 
 # name -> (function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
@@ -32,9 +31,8 @@ STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
 @click.option(
     "--keep", metavar="DIR", help="Where finished jobs are kept (default: .grounded-studies/NAME)."
 )
-@click.option("--png", metavar="FILE", help="Draw the study's picture.")
 def experiment(
-    name: str | None, seeds: str | None, engine: Engine, keep: str | None, png: str | None
+    name: str | None, seeds: str | None, engine: Engine, keep: str | None
 ) -> Iterator[Any]:
     """Run one of the paper's studies; the same seeds give the same results on any machine.
 
@@ -54,13 +52,9 @@ def experiment(
         if kind:
             given["progress"] = progress
         result = study(**given)
-    if png:
-        draw_study(name, result, Path(png))
     yield result
     for one in result.tables():
         show(f"{one.title}\n\n{table(one.rows, one.head)}\n")
-    if png:
-        show(f"picture {png}")
 
 
 def _unlike(text: str) -> click.UsageError:

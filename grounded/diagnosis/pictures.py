@@ -10,7 +10,7 @@ import numpy as np
 
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.telling import columns_told, larger
-from grounded.figures.figure import Bar, Bars, Curve, Figure, Panel, legend
+from grounded.figures.figure import Figure, Panel, bars, curve, legend, panel
 from grounded.result import figure, measured, measured_alike, percent, shown
 
 if TYPE_CHECKING:  # of which this is a part
@@ -47,7 +47,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
         return None
     caption = "" if errors[0].held_out != "no" else "not held out"
     key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
-    return Figure("accuracy", "Predictions before and after", caption, tuple(panels), key)
+    return Figure("accuracy", "Predictions before and after", caption, panels, key)
 
 
 def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> list[Panel]:
@@ -68,21 +68,14 @@ def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> li
             for rows, note in ((~whole, ""), (whole, WHOLE)):
                 if (values[rows] > 0).any():  # the axis is logarithmic
                     style = "line" if rows.sum() > 1 and not note else "points"
-                    curves.append(
-                        Curve(at[rows], values[rows], ROLES[key], name, 2.0, style=style, note=note)
-                    )
+                    x, y = at[rows], values[rows]
+                    curves.append(curve(x, y, ROLES[key], name, 2.0, style=style, note=note))
         if curves:
-            curves.sort(key=lambda curve: curve.role != "other")  # noise is drawn behind
+            curves.sort(key=lambda one: one["meta"]["role"] != "other")  # noise is drawn behind
             unit = shown(unit)
             label, across = f"{channel} [{unit}]" if unit else channel, "predicted ahead [s]"
-            panels.append(Panel(label, across, unit, tuple(curves), log=True, x_ticks=tuple(ticks)))
+            panels.append(panel(label, across, unit, curves, log=True, x_ticks=ticks))
     return panels
-
-
-def _in_unit(bars: Sequence[tuple[str, float, str]], unit: str) -> tuple[Bar, ...]:
-    """Return bars of (name, error, role) whose texts share one unit."""
-    texts = measured_alike([value for _, value, _ in bars], unit)
-    return tuple(Bar(n, v, text, role) for (n, v, role), text in zip(bars, texts, strict=True))
 
 
 def credit_figure(diagnosis: Diagnosis, states: int = STATES) -> Figure | None:
@@ -96,31 +89,33 @@ def credit_figure(diagnosis: Diagnosis, states: int = STATES) -> Figure | None:
     error = ahead[-1] if ahead and not ahead[-1].drowned else None
     changed = error.changes if error else {}
     names = sorted(changed, key=lambda name: changed[name])[:states]
-    panels = [worth_of(name, error, diagnosis) for name in names if error]
+    panels = [p for name in names if error and (p := worth_of(name, error, diagnosis))]
     if credit:
-        bars = [Bar(c.of, c.share, larger(c.times) or percent(c.share)) for c in credit[:MOST_BARS]]
-        panels.insert(0, Bars("Errors without each", tuple(bars)))
-    found = tuple(panel for panel in panels if panel.bars)
-    return Figure("credit", "What each is worth", "", found) if found else None
+        shares = [
+            (c.of, c.share, larger(c.times) or percent(c.share), "best") for c in credit[:MOST_BARS]
+        ]
+        panels.insert(0, bars("Errors without each", shares))
+    return Figure("credit", "What each is worth", "", panels) if panels else None
 
 
-def worth_of(name: str, error: RulerRow, diagnosis: Diagnosis) -> Bars:
+def worth_of(name: str, error: RulerRow, diagnosis: Diagnosis) -> Panel | None:
     """Return the error of a state with all causes and all but each.
 
     If effects were adopted before, also that of the model without them.
     """
     causes = diagnosis.credit
-    rows = [(("limit", "model.py"), error.outset)]  # {} if it is so
-    rows += [(("model", "model"), error.crude)]
+    told = [(("limit", "model.py"), error.outset)]  # {} if it is so
+    told += [(("model", "model"), error.crude)]
     if causes:  # else nothing was found: the same error once more
-        rows += [(("best", "all causes"), error.with_effects)]
+        told += [(("best", "all causes"), error.with_effects)]
     if len(causes) > 1:  # without the only one, it is the model before
-        rows += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST_BARS]]
-    rows += [(("other", columns_told(diagnosis)["noise_floor"]), error.noise_floor)]
-    known = [(look, errors[name]) for look, errors in rows if name in errors]
-    bars = [(label, v, role) for (role, label), v in known if math.isfinite(v)]
-    unit = error.unit_by_channel.get(name, "")
-    return Bars(f"{name}: error {error.horizon_s:.3g} s ahead", _in_unit(bars, unit))
+        told += [(("limit", f"all but {c.of}"), c.without_it) for c in causes[:MOST_BARS]]
+    told += [(("other", columns_told(diagnosis)["noise_floor"]), error.noise_floor)]
+    known = [(look, errors[name]) for look, errors in told if name in errors]
+    known = [(look, v) for look, v in known if math.isfinite(v)]
+    texts = measured_alike([v for _, v in known], error.unit_by_channel.get(name, ""))
+    rows = [(label, v, t, role) for ((role, label), v), t in zip(known, texts, strict=True)]
+    return bars(f"{name}: error {error.horizon_s:.3g} s ahead", rows) if rows else None
 
 
 def where_figure(diagnosis: Diagnosis) -> Figure | None:
@@ -134,9 +129,9 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
     by_time = [(f"{t.start:.4g} to {t.end:.4g} s", t.share, "") for t in where.times]
     by_region = [(r.told, r.share, f", {percent(r.occupancy)} occupancy") for r in where.regions]
     panels = [
-        Bars(
+        bars(
             f"Share by {word}",
-            tuple(Bar(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST_BARS]),
+            [(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST_BARS]],
         )
         for word, shares, role in (
             ("channel", by_channel, "best"),
@@ -146,10 +141,10 @@ def where_figure(diagnosis: Diagnosis) -> Figure | None:
         if shares
     ]
     if diagnosis.ranking:
-        evidence = tuple(
-            Bar(r.effect, r.evidence, figure(r.evidence, 3), "best" if r.claimed else "other")
+        evidence = [
+            (r.effect, r.evidence, figure(r.evidence, 3), "best" if r.claimed else "other")
             for r in diagnosis.ranking[:MOST_BARS]
-        )
-        panels.append(Bars("Evidence [nats]", evidence))
+        ]
+        panels.append(bars("Evidence [nats]", evidence))
     title = "Where the gap is" if by_channel else "Effects compared"
-    return Figure("gap", title, "", tuple(panels)) if panels else None
+    return Figure("gap", title, "", panels) if panels else None

@@ -1,21 +1,21 @@
-"""Figures as plain values, independent of the library that draws them.
+"""Figures as Plotly's own data: a page, a notebook and a picture draw the same traces.
 
-A figure has a title, a caption and panels; a panel has axes, curves and marks. Plotly draws them in
-a page and a notebook, matplotlib in a picture. Colours are roles ("best", "desired"), so that a
-page follows the reader's light or dark mode.
+`curve` and `Dot` make the contents of a `panel`, `bars` one of horizontal bars: traces and a layout
+as Plotly's JSON has them, with arrays in place of lists. Colours are roles ("@best", or
+"@best/0.15" with an opacity), so that a page follows the reader's light or dark mode. No function
+here needs Plotly.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from typing import Any
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.figures.body import Motion
 from grounded.frozen import Array
 
 # Okabe & Ito (2008), distinguishable with colour blindness: role -> (on white, on black)
@@ -40,11 +40,64 @@ DASHES = {
     "limit": (8.0, 2.0, 2.0, 2.0),
     "step2": (5.0, 2.0),
 }
+SYMBOLS = {"disc": "circle", "ring": "circle-open", "cross": "x-thin", "dash": "line-ew"}
 TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 SMALLEST_RANGE = 1e-12  # range below which differences are rounding errors
-LARGE_DOTS = 300  # most dots that are drawn large
+MOST_POINTS = 1600  # most points of a curve
+CONTEXT = 300  # most points of a curve that is only context
 LETTER = 0.045  # width of a letter of a bar's text, as a share of the longest bar
+LABEL_LETTERS = 26  # most letters in a line of a bar's label
+TICKS = 5  # most ticks of a logarithmic axis
 FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # factors by which deviations may be enlarged
+Trace = dict[str, Any]
+
+
+class Dot(NamedTuple):
+    """A point with the text shown on hovering; without a finite y it is on the lower edge."""
+
+    x: float
+    y: float
+    role: str
+    note: str
+    shape: str = "disc"  # one of SYMBOLS
+    error: float = 0.0  # half the height of an error bar
+    trial: str = ""
+
+
+class Key(NamedTuple):
+    """An entry of a figure's legend; `trial` is set for the path of a trial of role "other"."""
+
+    role: str
+    name: str
+    shape: str = "line"  # line, band, or one of SYMBOLS
+    trial: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Panel:
+    """Axes with traces; `layout` has Plotly's xaxis, yaxis and shapes."""
+
+    title: str
+    data: Sequence[Trace]
+    layout: Mapping[str, Any] = field(default_factory=dict)
+    note: str = ""  # text behind the title
+    kind: str = ""  # time or forecast: x is a time; path: positions of a run; bars
+
+    @property
+    def curves(self) -> list[Trace]:
+        """The traces that are no marks and no bars."""
+        return [t for t in self.data if t["meta"]["style"] not in (*SYMBOLS, "bar")]
+
+
+@dataclass(frozen=True, eq=False)
+class Figure:
+    """Panels that belong together, with one legend; `name` is the name of its file."""
+
+    name: str
+    title: str
+    caption: str
+    panels: Sequence[Panel]
+    key: Sequence[Key] = ()
 
 
 def typeset(value: Any) -> Any:
@@ -60,200 +113,276 @@ def rgb(colour: str) -> tuple[int, int, int]:
     return int(colour[1:3], 16), int(colour[3:5], 16), int(colour[5:7], 16)
 
 
-@dataclass(frozen=True, eq=False)
-class Curve:
-    """A line through points; NaN breaks it. Curves for context have no name.
+# contents of a panel
 
-    times: time of each point of a path [s].
-    shade: a value for each point, shown as its colour; `shade_name` is its name.
-    trial: the trial whose path it is, so that an animation finds a trial's parts.
-    motion: the body that moves along the path.
+
+def curve(
+    x: Array,
+    y: Array,
+    role: str,
+    name: str = "",
+    width: float = 1.5,
+    *,
+    style: str = "line",
+    trial: str = "",
+    times: Array | None = None,
+    note: str = "",
+) -> Trace:
+    """Return a line through points; NaN breaks it. Curves for context have no name.
+
+    Args:
+        x: (T,) positions.
+        y: (T,) values.
+        role: its colour.
+        name: its name in the legend.
+        width: of the line [px].
+        style: line, steps (each y holds until the next x), points, or ghost: not drawn, only for
+            the marks of the page's slider.
+        trial: the trial whose path it is, so that the slider finds it.
+        times: (T,) time of each point of a path [s].
+        note: text shown before y on hovering.
     """
-
-    x: Array
-    y: Array
-    role: str
-    name: str = ""
-    width: float = 1.5
-    times: Array | None = None
-    shade: Array | None = None
-    shade_name: str = ""
-    trial: str = ""
-    style: str = "line"  # line, steps (each y holds until the next x), points,
-    # or ghost: not drawn, only used by the animation
-    motion: Motion | None = None
-    note: str = ""  # text shown before y on hovering
-
-    def spread(self, axis: int) -> list[Array]:
-        """Return the values that must fit on the x axis (0) or the y axis (1)."""
-        moved = [] if self.motion is None else [self.motion.reached[:, axis]]
-        return [(self.x, self.y)[axis], *moved]
-
-
-@dataclass(frozen=True)
-class Dot:
-    """A point with the text shown on hovering."""
-
-    x: float
-    y: float
-    role: str
-    note: str
-    shape: str = "disc"  # disc, ring, cross, dash
-    error: float = 0.0  # half the height of an error bar
-    trial: str = ""
+    near = name and role != "other" and style != "ghost"
+    index = thinned(x, y, MOST_POINTS if near else CONTEXT)
+    hover = f"{note}: %{{y:.5g}}" if note else "%{y:.5g}"
+    trace: Trace = {
+        "type": "scatter", "mode": "lines", "x": x[index], "y": y[index], "name": name,
+        "line": {"color": f"@{role}", "width": width} | _dash(role), "hovertemplate": hover,
+        "meta": {"role": role, "trial": trial, "style": style},
+    }  # fmt: skip
+    if times is not None:
+        trace["customdata"] = times[index]
+        trace["hovertemplate"] = "%{customdata:.2f} s: (%{x:.4g}, %{y:.4g})"
+    if not name:
+        trace |= {"hoverinfo": "skip", "hovertemplate": ""}
+    if style == "points":
+        trace |= {"mode": "markers", "marker": {"color": f"@{role}/0.5", "size": 5}}
+    elif style == "steps":
+        trace["line"]["shape"] = "hv"
+    elif style == "ghost":
+        trace["visible"] = False
+    return trace
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A horizontal line across the panel."""
-
-    y: float
-    role: str
-    name: str
+def rule(y: float, role: str, name: str) -> Trace:
+    """Return a horizontal line across the panel."""
+    line = {"color": f"@{role}", "width": 1.2} | _dash(role)
+    return _across(y, y) | {"type": "line", "line": line, "layer": "above", "name": name}
 
 
-@dataclass(frozen=True)
-class Band:
-    """A faint horizontal band across the panel."""
-
-    low: float
-    high: float
-    role: str
-    note: str
+def band(low: float, high: float, role: str) -> Trace:
+    """Return a faint horizontal band across the panel."""
+    look = {"type": "rect", "fillcolor": f"@{role}/0.15", "line": {"width": 0}, "layer": "below"}
+    return _across(low, high) | look
 
 
-@dataclass(frozen=True, eq=False)
-class Panel:
-    """Axes with curves and marks.
+def _across(low: float, high: float) -> Trace:
+    return {"xref": "x domain", "yref": "y", "x0": 0, "x1": 1, "y0": low, "y1": high}
 
-    loss: the y axis is logarithmic in -y.
-    log: both axes are logarithmic.
+
+def _dash(role: str) -> dict[str, str]:
+    dash = ",".join(f"{v:g}px" for v in DASHES.get(role, ()))
+    return {"dash": dash} if dash else {}
+
+
+def panel(
+    title: str,
+    x_name: str,
+    y_name: str,
+    curves: Sequence[Trace],
+    dots: Sequence[Dot] = (),
+    shapes: Sequence[Trace] = (),
+    *,
+    equal: bool = False,
+    loss: bool = False,
+    log: bool = False,
+    whole: bool = False,
+    x_ticks: Sequence[tuple[float, str]] = (),
+    y_range: tuple[float, float] | None = None,
+    note: str = "",
+    kind: str = "",
+) -> Panel:
+    """Return axes that contain every named curve, every dot and every rule.
+
+    Args:
+        title: of the panel.
+        x_name: title of the x axis.
+        y_name: title of the y axis.
+        curves: made by `curve`.
+        dots: its marks.
+        shapes: made by `rule` and `band`.
+        equal: equal scales on both axes.
+        loss: the y axis shows losses y < 0 by the logarithm of -y, the smallest at the top.
+        log: both axes are logarithmic; what has no logarithm is left out.
+        whole: x values are whole numbers.
+        x_ticks: positions and labels of ticks; () for automatic.
+        y_range: ends of the y axis, if not those of the contents.
+        note: text behind the title.
+        kind: see `Panel`.
     """
+    # what must be seen
+    drawn = [one for one in curves if one["meta"]["style"] != "ghost"]
+    drawn = [one for one in drawn if one["name"]] or drawn
+    xs = [one["x"] for one in drawn] + [np.array([dot.x for dot in dots])]
+    lines = [shape["y0"] for shape in shapes if shape["type"] == "line"]
+    ys = [one["y"] for one in drawn] + [np.array([*(dot.y for dot in dots), *lines], float)]
 
-    title: str
-    x_name: str
-    y_name: str
-    curves: tuple[Curve, ...] = ()
-    dots: tuple[Dot, ...] = ()
-    rules: tuple[Rule, ...] = ()
-    bands: tuple[Band, ...] = ()
-    equal: bool = False  # equal scales on both axes
-    loss: bool = False
-    log: bool = False
-    whole: bool = False  # x values are whole numbers
-    x_ticks: tuple[tuple[float, str], ...] = ()  # positions and labels of ticks; () for automatic
-    y_range: tuple[float, float] | None = None
-    note: str = ""  # text inside, top right
-    kind: str = ""  # time: x is the time of a run; path: positions of a run
+    # a loss is drawn as the cost -y; what is no loss is drawn as the smallest
+    if loss:
+        least = min((-float(y[y < 0].max()) for y in ys if (y < 0).any()), default=1.0)
+        curves = [one | {"y": np.maximum(-one["y"], least)} for one in curves]
+        dots = [dot._replace(y=max(-dot.y, least)) for dot in dots]
+        ends = ({end: max(-one[end], least) for end in ("y0", "y1")} for one in shapes)
+        shapes = [one | changed for one, changed in zip(shapes, ends, strict=True)]
+        ys = [np.maximum(-y, least) for y in ys]
+    if log:
+        curves = [_positive(one) for one in curves]
 
-    def height(self, y: float | Array) -> Array:
-        """Return the position of a value on the y axis: y, log10(y), or -log10(-y) of a loss."""
-        y = np.asarray(y, float)
-        if self.log:
-            return _log10(y)
-        if not self.loss:
-            return y
-        with np.errstate(divide="ignore", invalid="ignore"):
-            return np.asarray(-np.log10(-np.minimum(y, self._largest)))
+    # the axes
+    margin = 0.06 if equal else 0.03 if dots or kind != "time" else 0.0
+    left, right = fitted(map(_log10, xs) if log else xs, margin)
+    if whole:
+        left, right = left - 0.6, right + 0.6
+    low, high = y_range or fitted(map(_log10, ys) if log or loss else ys)
+    across, up = _axis(x_name, left, right), _axis(y_name, low, high)
+    if whole:
+        across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
+    for axis, logarithmic in ((across, log), (up, log or loss)):
+        if logarithmic:
+            ticks, sign = log_ticks(*axis["range"]), "−" * loss
+            axis |= {"type": "log", "tickvals": ticks, "ticktext": [f"{sign}{v:g}" for v in ticks]}
+    if loss:
+        up["range"] = [high, low]
+    if x_ticks:
+        at, labels = zip(*x_ticks, strict=True)
+        labels = tuple(label.replace("\n", "<br>") for label in labels)
+        across |= {"tickvals": list(at), "ticktext": [*labels], "ticklabeloverflow": "allow"}
+    if equal:
+        up["scaleanchor"] = "x"
 
-    @property
-    def _largest(self) -> float:
-        known = [v[np.isfinite(v) & (v < 0)] for v in self._heights()]
-        return max((float(v.max()) for v in known if len(v)), default=-1.0)
-
-    def _heights(self) -> list[Array]:
-        marks = [d.y for d in self.dots] + [rule.y for rule in self.rules]
-        return [*(y for c in self._seen for y in c.spread(1)), np.array(marks)]
-
-    @property
-    def _seen(self) -> list[Curve]:
-        named = [c for c in self.curves if c.name] or list(self.curves)
-        return [c for c in named if c.style != "ghost"]
-
-    def ranges(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Return the ranges of x and of y (as `height`) that contain everything with a name."""
-        xs = [_log10(x) if self.log else x for c in self._seen for x in c.spread(0)] + [
-            np.array([d.x for d in self.dots])
-        ]
-        margin = 0.06 if self.equal else 0.03 if self.dots or self.kind != "time" else 0.0
-        low, high = fitted(xs, margin)
-        if self.whole:
-            low, high = low - 0.6, high + 0.6
-        ends = self.y_range or fitted([self.height(v) for v in self._heights()])
-        return (low, high), ends
+    # the marks, a trace for each look
+    looks: dict[tuple[Any, ...], list[Dot]] = {}
+    for dot in dots:
+        looks.setdefault((dot.role, dot.shape, dot.error > 0, dot.trial), []).append(dot)
+    ends_ = [10.0**low, 10.0**high] if log or loss else [low, high]
+    edge = ends_[1] if loss else ends_[0]
+    data = [*curves, *(_marks(same, edge) for same in looks.values())]
+    layout = {"xaxis": across, "yaxis": up, "shapes": [*shapes]}
+    return Panel(title, data, layout, note, kind)
 
 
-@dataclass(frozen=True)
-class Bar:
-    """A horizontal bar with its label and the text behind it."""
-
-    label: str
-    value: float
-    text: str
-    role: str = "best"
+def _positive(trace: Trace) -> Trace:
+    """Return the points of a line that have a logarithm, with a mark at each."""
+    known, mode = trace["y"] > 0, trace["mode"].replace("lines", "lines+markers")
+    return trace | {"x": trace["x"][known], "y": trace["y"][known], "mode": mode}
 
 
-@dataclass(frozen=True)
-class Bars:
-    """Horizontal bars from zero, one below the other."""
-
-    title: str
-    bars: tuple[Bar, ...]
-
-    @property
-    def values(self) -> Array:
-        """Length of each bar."""
-        return np.array([bar.value if np.isfinite(bar.value) else 0.0 for bar in self.bars])
-
-    @property
-    def ends(self) -> tuple[float, float]:
-        """Range of the axis, with room for the bars and the text behind each."""
-        most = float(np.abs(self.values).max(initial=0.0)) or 1.0
-        room = np.array([most * (0.05 + LETTER * len(bar.text)) for bar in self.bars])
-        ends = self.values + np.where(self.values < 0, -room, room)
-        return float(ends.min(initial=0.0)), float(ends.max(initial=0.0)) or most
+def _axis(name: str, low: float, high: float) -> dict[str, Any]:
+    return {
+        "title": {"text": name, "standoff": 6}, "range": [low, high], "gridcolor": "@grid",
+        "zeroline": False, "linecolor": "@grid", "automargin": True,
+    }  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Key:
-    """An entry of a figure's legend; `trial` is set for the path of a trial of role "other"."""
+def _marks(dots: Sequence[Dot], edge: float) -> Trace:
+    """Return the trace of marks of one look; those without a finite y are on the edge."""
+    one, y = dots[0], np.array([dot.y if np.isfinite(dot.y) else edge for dot in dots])
+    size, width = (9, 1.5) if one.shape in ("disc", "ring") else (11, 2.5)
+    look = {"color": f"@{one.role}", "line": {"color": f"@{one.role}", "width": width}}
+    trace = {
+        "type": "scatter", "mode": "markers", "x": np.array([dot.x for dot in dots]), "y": y,
+        "text": [dot.note.replace("\n", "<br>") for dot in dots], "hovertemplate": "%{text}",
+        "name": "", "meta": {"role": one.role, "trial": one.trial, "style": one.shape},
+        "marker": look | {"symbol": SYMBOLS[one.shape], "size": size}, "cliponaxis": False,
+    }  # fmt: skip
+    if one.error > 0:
+        trace["error_y"] = {
+            "type": "data", "array": np.array([dot.error for dot in dots]),
+            "color": f"@{one.role}", "thickness": 1.2, "width": 0,
+        }  # fmt: skip
+    return trace
 
-    role: str
-    name: str
-    shape: str = "line"
-    trial: str = ""
+
+def bars(title: str, rows: Sequence[tuple[str, float, str, str]]) -> Panel:
+    """Return horizontal bars from zero, one below the other.
+
+    Args:
+        title: of the panel.
+        rows: label, value, the text behind the bar, and role of each.
+    """
+    labels, values, texts, roles = zip(*rows[::-1], strict=True)  # Plotly's first is the lowest
+    lengths = np.where(np.isfinite(values), values, 0.0)
+    most = float(np.abs(lengths).max()) or 1.0
+    room = np.array([most * (0.05 + LETTER * len(text)) for text in texts])
+    ends = lengths + np.where(lengths < 0, -room, room)
+    trace = {
+        "type": "bar", "orientation": "h", "x": lengths, "y": list(range(len(rows))),
+        "text": [*texts], "textposition": "outside", "cliponaxis": False,
+        "marker": {"color": [f"@{role}" for role in roles]}, "hoverinfo": "skip", "name": "",
+        "textfont": {"color": "@text"}, "meta": {"role": "", "trial": "", "style": "bar"},
+    }  # fmt: skip
+    reached = [min(float(ends.min()), 0.0), max(float(ends.max()), 0.0)]
+    across = {"range": reached, "visible": False, "fixedrange": True}
+    up = {
+        "tickvals": trace["y"], "ticktext": [in_lines(label) for label in labels],
+        "automargin": True, "showgrid": False, "zeroline": False, "fixedrange": True,
+    }  # fmt: skip
+    return Panel(title, [trace], {"xaxis": across, "yaxis": up}, kind="bars")
 
 
-@dataclass(frozen=True, eq=False)
-class Figure:
-    """Panels that belong together, with one legend; `name` is the name of its file."""
+def in_lines(label: str) -> str:
+    """Break a label that is too long for a small panel, after a blank, a colon or a plus."""
+    if len(label) <= LABEL_LETTERS:
+        return label
+    lines = [""]
+    for part in re.findall(r"[^ :+]+[ :+]?", label):
+        if lines[-1] and len(lines[-1] + part.rstrip()) > LABEL_LETTERS:
+            lines.append("")
+        lines[-1] += part
+    return "<br>".join(line.rstrip() for line in lines)
 
-    name: str
-    title: str
-    caption: str
-    panels: tuple[Panel | Bars, ...]
-    key: tuple[Key, ...] = ()
+
+def label_lines(panel: Panel) -> int:
+    """Return in how many lines the longest label of bars is broken."""
+    labels: Sequence[str] = panel.layout["yaxis"]["ticktext"]
+    return max(label.count("<br>") + 1 for label in labels)
+
+
+def legend(panels: Sequence[Panel]) -> tuple[Key, ...]:
+    """Return a legend entry for each named curve and rule of the panels, without duplicates."""
+    found: dict[tuple[str, str], Key] = {}
+    for one in panels:
+        for trace in one.curves:
+            role, style = trace["meta"]["role"], trace["meta"]["style"]
+            if trace["name"] and style != "ghost":
+                shape = "disc" if style == "points" else "line"
+                trial = trace["meta"]["trial"] if role == "other" else ""
+                found.setdefault((role, trace["name"]), Key(role, trace["name"], shape, trial))
+        for shape in one.layout.get("shapes", ()):
+            if name := shape.get("name"):
+                role = shape["line"]["color"][1:]
+                found.setdefault((role, name), Key(role, name))
+    return tuple(found.values())
+
+
+def key_trace(key: Key) -> Trace:
+    """Return a trace without points that stands for an entry of a legend."""
+    colour = f"@{key.role}"
+    trace: Trace = {"type": "scatter", "x": [None], "y": [None], "name": key.name, "mode": "lines"}
+    if key.shape in SYMBOLS:
+        look = {"size": 9, "color": colour, "line": {"width": 2, "color": colour}}
+        return trace | {"mode": "markers", "marker": look | {"symbol": SYMBOLS[key.shape]}}
+    if key.shape == "band":
+        return trace | {"line": {"color": f"{colour}/0.3", "width": 10}}
+    return trace | {"line": {"color": colour, "width": 2} | _dash(key.role)}
+
+
+# ranges, ticks, points
 
 
 def _log10(values: Array) -> Array:
     """Return log10; NaN for values without a logarithm."""
     return np.log10(np.where(values > 0, values, np.nan))
-
-
-def legend(panels: Sequence[Panel | Bars]) -> tuple[Key, ...]:
-    """Return a legend entry for each named curve and rule of the panels, without duplicates."""
-    found: dict[tuple[str, str], Key] = {}
-    for panel in panels:
-        if isinstance(panel, Bars):
-            continue
-        for c in panel.curves:
-            if c.name and c.style != "ghost":
-                shape = "disc" if c.style == "points" else "line"
-                trial = c.trial if c.role == "other" else ""
-                found.setdefault((c.role, c.name), Key(c.role, c.name, shape, trial))
-        for rule in panel.rules:
-            found.setdefault((rule.role, rule.name), Key(rule.role, rule.name))
-    return tuple(found.values())
 
 
 def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]:
@@ -281,24 +410,18 @@ def without_astray(kept: list[Array], more: list[Array], most: float = 3.0) -> l
     return [*kept, *inside]
 
 
-def loss_ticks(low: float, high: float, most: int = 5) -> list[float]:
-    """Return ticks for an axis of losses with `height` from low to high: -1, -2, -5, -10 ..."""
-    powers = range(math.floor(-high) - 1, math.ceil(-low) + 2)
-    for factors in ((1, 1.5, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,)):
-        values = [-f * 10.0**k for k in powers for f in factors]
-        values = [v for v in values if low <= -math.log10(-v) <= high]
-        if len(values) <= most:
-            break
-    if len(values) > most + 2:  # many powers of ten: every second, third ... of them
-        values = values[:: -(-len(values) // most)]
-    if len(values) < 2:
-        values = [float(f"{-(10.0**-v):.2g}") for v in np.linspace(low, high, 4)]
-    return sorted(values)
-
-
 def log_ticks(low: float, high: float) -> list[float]:
     """Return ticks for an axis of values from 10^low to 10^high: 1, 2, 5, 10 ..."""
-    return sorted(-loss for loss in loss_ticks(-high, -low))
+    powers = np.arange(np.floor(low) - 1, np.ceil(high) + 2)
+    values: list[float] = []
+    for factors in ((1, 1.5, 2, 3, 5, 7), (1, 2, 5), (1, 3), (1,)):
+        every = [f * 10.0**k for k in powers.tolist() for f in factors]
+        values = [v for v in every if low <= np.log10(v) <= high]
+        if len(values) <= TICKS:
+            break
+    if len(values) < 2:
+        return sorted(float(f"{10.0**v:.2g}") for v in np.linspace(low, high, 4))
+    return values[:: -(-len(values) // (TICKS + 2))]  # of many powers of ten every second, third
 
 
 def enlarging(path: Array, desired: Array) -> float:

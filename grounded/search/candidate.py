@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from grounded.figures.figure import Curve, Figure, Panel, legend
+from grounded.figures.figure import Figure, curve, legend, panel
 from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
@@ -163,12 +163,12 @@ class Candidate(Result):
         panels = []
         for name, values in columns:
             times = np.arange(len(values), dtype=np.float64) * self.policy.dt
-            curve = Curve(times, values, "predicted", "predicted")
+            drawn = curve(times, values, "predicted", "predicted")
             unit = shown(self.units.get(name, ""))
             title = f"{name} [{unit}]" if unit else name
-            panels.append(Panel(title, "time [s]", unit, (curve,), kind="time"))
+            panels.append(panel(title, "time [s]", unit, [drawn], kind="time"))
         title = f"{self.id}: predicted utility {figure(self.predicted_utility)}"
-        return (Figure("candidate", title, "", tuple(panels), legend(panels[:1])),)
+        return (Figure("candidate", title, "", panels, legend(panels[:1])),)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.figures.figure import Band, Curve, Dot, Figure, Key, Panel, Rule
+from grounded.figures.figure import Dot, Figure, Key, Panel, Trace, band, curve, panel, rule
 from grounded.result import figure
 from grounded.search.candidate import Tried
 
@@ -53,7 +52,7 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
         key.append(Key("model", "crashed", "cross"))
     if optimum is not None:
         key.append(Key("accepted", "optimum of the real system"))
-    if whole.bands:
+    if any(shape["type"] == "rect" for shape in whole.layout["shapes"]):
         key.append(Key("other", "±2 standard errors of the best", "band"))
     stepped = any(t.candidate.grounded for t in shown)
     caption = (
@@ -87,26 +86,24 @@ def _utility(
     now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None
 ) -> Panel:
     dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
-    rules, bands = [], []
+    shapes = list[Trace]()
     values = [d.y for d in dots if math.isfinite(d.y)]
     if optimum is not None:
-        rules.append(Rule(optimum, "accepted", "optimum"))
+        shapes.append(rule(optimum, "accepted", "optimum"))
         values.append(optimum)
     best = now.incumbent
     if best is not None and 0 < best.standard_error < math.inf:
         error = 2 * best.standard_error
-        note = f"{figure(best.utility)} ± {figure(error, 2)}: two standard errors of the best"
-        bands.append(Band(best.utility - error, best.utility + error, "other", note))
+        shapes.append(band(best.utility - error, best.utility + error, "other"))
     loss = bool(values) and max(values) < 0 and min(values) < STEEP * max(values)
-    return Panel(
-        title="Utility of each candidate" + (", logarithmic" if loss else ""),
-        x_name="candidate",
-        y_name="utility",
-        curves=_record(now.history, number),
+    return panel(
+        "Utility of each candidate" + (", logarithmic" if loss else ""),
+        "candidate",
+        "utility",
+        _record(now.history, number),
+        dots,
+        shapes,
         x_ticks=_named(now.history, number),
-        dots=tuple(dots),
-        rules=tuple(rules),
-        bands=tuple(bands),
         loss=loss,
         whole=True,
     )
@@ -130,11 +127,11 @@ def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
     shape, role = _look(tried, became)
     dots = [Dot(at, tried.utility, role, note, shape, error if math.isfinite(error) else 0.0)]
     if math.isfinite(tried.promised):
-        dots.insert(0, replace(expected, note=note))
+        dots.insert(0, expected._replace(note=note))
     return dots
 
 
-def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]:
+def _record(tried: Sequence[Tried], number: dict[str, int]) -> list[Trace]:
     """Return the curve of the best utility so far, as steps."""
     best, steps = -math.inf, []
     for t in tried:
@@ -142,10 +139,10 @@ def _record(tried: Sequence[Tried], number: dict[str, int]) -> tuple[Curve, ...]
             best = t.utility
             steps.append((float(number[t.candidate.id]), best))
     if not steps:
-        return ()
+        return []
     at, values = np.array(steps).T
     x = np.append(np.repeat(at, 2)[1:], float(max(number.values())))
-    return (Curve(x, np.repeat(values, 2), "best", "", 1.2),)
+    return [curve(x, np.repeat(values, 2), "best", "", 1.2)]
 
 
 def _named(shown: Sequence[Tried], number: dict[str, int]) -> tuple[tuple[float, str], ...]:
@@ -181,12 +178,13 @@ def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
         dots.append(Dot(number[c.id], size, role, note, shape))
     low, high = (end(d.y for d in dots) for end in (min, max))
     title = "Step size: log₂ α (0: full step, −1: half)"
-    return Panel(
-        title="Step size: log₁₀ damping (higher: more cautious)" if damped else title,
-        x_name="candidate",
-        y_name="log₁₀ damping" if damped else "log₂ α",
+    return panel(
+        "Step size: log₁₀ damping (higher: more cautious)" if damped else title,
+        "candidate",
+        "log₁₀ damping" if damped else "log₂ α",
+        (),
+        dots,
         x_ticks=_named(shown, number),
-        dots=tuple(dots),
         whole=True,
         y_range=(low - 0.5, high + 0.5) if damped else (min(low, -1.0) - 0.4, 0.6),
     )

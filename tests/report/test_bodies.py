@@ -1,12 +1,11 @@
-"""Bodies: links, carriages and cabins where the angles say; a MuJoCo file's own geometry."""
+"""Bodies: links and carriages where the angles say; a MuJoCo file's own geometry."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from grounded.figures.body import motion
-from grounded.models import arm, cart_pole, lift, pendulum
+from grounded.models import arm, cart_pole, pendulum
 from grounded_trials.report.bodies import body_of, is_mechanism, scene_of
 
 
@@ -23,7 +22,6 @@ def _body(model):
         (cart_pole.model, [2.0, np.pi / 2, 0.0, 0.0], (2.5, 0.0)),  # a pole that falls to +x
         (arm.model, [0.0, 0.0, 0.0, 0.0], (2.0, 0.0)),
         (arm.model, [np.pi / 2, -np.pi / 2, 0.0, 0.0], (1.0, 1.0)),
-        (lift.model, [3.0, 0.0], (0.0, 3.0)),
     ],
 )
 def test_the_tip_is_where_the_angles_say(model, state, tip):
@@ -32,30 +30,17 @@ def test_the_tip_is_where_the_angles_say(model, state, tip):
     np.testing.assert_allclose(body.path(np.array([state]))[0], [tip[0], 0.0, tip[1]], atol=1e-12)
 
 
-@pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model, lift.model])
-def test_a_motion_is_the_body_seen_from_the_side(model):
+@pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model])
+def test_each_link_points_to_the_next_joint(model):
     body, states = _body(model), np.random.default_rng(0).normal(size=(5, model.n))
-    states[1] = np.nan
-    states[2, -1] = np.nan  # a rate: it moves nothing
-    seen = motion(body, states, 0.1)
-    assert seen is not None
-    np.testing.assert_allclose(seen.times, [0.0, 0.2, 0.3, 0.4])
-    known, filled = states[[0, 2, 3, 4]], np.nan_to_num(states[[0, 2, 3, 4]])
-    for row, (tip, poses) in enumerate(
-        zip(
-            body.path(known),
-            zip(*[list(p[0]) for p in body.poses(filled)], strict=True),
-            strict=True,
-        )
-    ):
-        lines = [line for line, _ in seen.lines(row)]
-        if model is lift.model:
-            np.testing.assert_allclose(np.mean(lines[0][:4], axis=0), tip[[0, 2]], atol=1e-9)
-            continue
-        links = [line for line in lines if len(line) == 2]
-        np.testing.assert_allclose([line[0] for line in links], np.array(poses)[: len(links), ::2])
-        np.testing.assert_allclose(links[-1][1], tip[[0, 2]], atol=1e-9)
-    assert motion(body, np.full((3, model.n), np.nan), 0.1) is None
+    links = [part for part in body.parts if part.shape == "capsule"]
+    poses = body.poses(states)[: len(links)]
+    ends = [
+        at + part.size[1] * turned[:, :, 2] for part, (at, turned) in zip(links, poses, strict=True)
+    ]
+    for end, (joint, _) in zip(ends, poses[1:], strict=False):
+        np.testing.assert_allclose(end, joint, atol=1e-9)
+    np.testing.assert_allclose(ends[-1], body.path(states), atol=1e-9)
 
 
 MJCF = """
@@ -96,7 +81,3 @@ def test_a_mujoco_model_looks_as_its_file_says():
     np.testing.assert_allclose(poses[3][1][0, :, 2], [1, 0, 0], atol=1e-9)
     np.testing.assert_allclose(body.path(states)[0], [2.2, 0, 0.05], atol=1e-9)
     assert np.isnan(body.path(np.full((1, 4), np.nan))).all()
-    seen = motion(body, states, 0.1)
-    assert seen is not None
-    rod = seen.lines(0)[2][0]  # after the cart's two rings
-    np.testing.assert_allclose(np.sort(rod, axis=0), ends[:, [0, 2]], atol=1e-9)

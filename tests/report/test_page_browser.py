@@ -10,14 +10,9 @@ import numpy as np
 import pytest
 from test_page import hostile
 
-from cli import grounded
-from grounded_trials.report.bodies import body_in
-from grounded_trials.report.gathering import gather
 from grounded_trials.report.page import page
-from grounded_trials.workspace.folder import Folder
 from page_browser import browser, missing
 from reported import car, cart, gathered
-from workspaces import make
 
 __all__ = ["car", "cart"]
 pytestmark = [
@@ -126,80 +121,6 @@ def test_the_slider_moves_the_run_along_its_path(opened, car):
         ("desired", findings.task.target),
     ):
         np.testing.assert_allclose(at[name], states[k, columns], atol=0.01, err_msg=name)
-
-
-@pytest.fixture(scope="module")
-def swing(tmp_path_factory):
-    """A pendulum after two trials, and its page."""
-    folder = tmp_path_factory.mktemp("swing") / "swing"
-    make(folder, "pendulum")
-    assert grounded("-C", folder, "learn", "--trials", 2).code == 0
-    findings = gather(Folder(folder))
-    path = folder / "page.html"
-    path.write_text(page(findings))
-    return findings, path
-
-
-LINKS = (
-    "const p = document.getElementById('paths-0'), { xaxis, yaxis } = p._fullLayout;"
-    "return Object.fromEntries([...p.querySelectorAll('svg.body g')].map(g => ["
-    " g.getAttribute('class'), [...g.children].map(line => line.getAttribute('d').slice(1)"
-    "  .split('L').map(at => at.split(' ').map(Number))"
-    "  .map(([x, y]) => [xaxis.p2l(x), yaxis.p2l(y)]))]))"
-)
-
-
-def _links_are_where_the_states_say(window, findings, run):
-    body, k = body_in(findings), window.run("return document.documentElement.dataset.time")
-    k = float(k) / findings.task.dt
-    drawn = window.run(LINKS)
-    for name, states in (
-        ("real", run.trial.states),
-        ("predicted", run.candidate.predicted_states),
-        ("desired", findings.task.target),
-    ):
-        path = body.path(states)[:, [0, 2]]
-        tip = [np.interp(k, np.arange(len(path)), axis) for axis in path.T]
-        (link,) = drawn[name]
-        np.testing.assert_allclose(link, [[0.0, 0.0], tip], atol=2e-3, err_msg=name)
-
-
-def test_a_pendulum_swings_as_its_states_say(window, swing):
-    findings, path = swing
-    best, (first, *_) = findings.best, findings.runs
-    window.dark(False)
-    window.resize(1400, 900)
-    window.open(path)
-    window.draw_all()
-    assert best is not None and best.trial.id != first.trial.id
-    for start, end in ((0.02, 0.3), (0.3, 0.45)):
-        window.drag("time", start, end)
-        _links_are_where_the_states_say(window, findings, best)
-    before = window.run(LINKS)["real"]
-    window.drag("paths-0", 0.3, 0.7)  # zoomed: the body goes with it
-    assert _range(window, "paths-0")[1] < 0.6
-    _links_are_where_the_states_say(window, findings, best)
-    window.run(
-        "const w = document.getElementById('which'); w.value = arguments[0];"
-        "w.dispatchEvent(new Event('change'))",
-        first.trial.id,
-    )
-    time.sleep(0.3)
-    _links_are_where_the_states_say(window, findings, first)
-    assert window.run(LINKS)["real"] != before
-    window.click("#play")
-    time.sleep(0.5)
-    window.click("#play")
-    _links_are_where_the_states_say(window, findings, first)
-    media = [{"media": "print"}, {"media": ""}]
-    shown = (
-        "return ['svg.body', 'i.over'].map("
-        "e => getComputedStyle(document.querySelector(e)).display)"
-    )
-    window.devtools("Emulation.setEmulatedMedia", media[0])
-    assert window.run(shown) == ["block", "none"]
-    window.devtools("Emulation.setEmulatedMedia", media[1])
-    assert window.errors() == []
 
 
 @pytest.mark.parametrize(("width", "dark"), [(1400, False), (390, True)])

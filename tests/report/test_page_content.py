@@ -43,10 +43,12 @@ def test_no_path_is_desired_of_a_state_without_a_weight(car):
     findings = weighed(gathered(car), x=10.0, y=10.0)
     states, errors = state_figure(findings), error_figure(findings)
     assert states is not None and errors is not None
-    desired = {p.title for p in states.panels if any(c.role == "desired" for c in p.curves)}
+    desired = {
+        p.title for p in states.panels if any(c["meta"]["role"] == "desired" for c in p.curves)
+    }
     assert desired == {"x [m]", "y [m]"} and "v [m/s]" in {p.title for p in states.panels}
     assert not any(p.title.startswith(("v ", "psi ")) for p in errors.panels)
-    assert not any(dot.role == "desired" for p in states.panels for dot in p.dots)
+    assert not any("desired at" in str(t.get("text")) for p in states.panels for t in p.data)
 
 
 def test_states_that_no_sensor_gives_are_said_to_be_estimates(cart):

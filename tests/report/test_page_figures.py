@@ -14,13 +14,7 @@ from grounded.diagnosis.error_report import Credit, RulerRow
 from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure
 from grounded.experiments.pendulum import pendulum_task
-from grounded.figures.figure import (
-    Curve,
-    Figure,
-    Panel,
-    log_ticks,
-)
-from grounded.figures.interactive import plotted
+from grounded.figures.figure import Dot, Figure, curve, log_ticks, panel, rule
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -37,7 +31,7 @@ __all__ = ["car", "cart"]
 
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
-FIGURES += ("gap", "forecast", "residual", "autocorrelation")
+FIGURES += ("gap", "forecast", "residual")
 
 
 @pytest.mark.slow
@@ -119,13 +113,26 @@ def test_results_plot_what_the_page_shows(cart):
 
 
 def test_logarithmic_panels_show_what_has_a_logarithm():
-    curve = Curve(np.array([0.1, 1.0, 10.0]), np.array([1e-5, 0.0, 10.0]), "best", "b")
-    panel = Panel("p", "x", "y", (curve,), log=True)
-    (left, right), (low, high) = panel.ranges()
+    line = curve(np.array([0.1, 1.0, 10.0]), np.array([1e-5, 0.0, 10.0]), "best", "b")
+    drawn = panel("p", "x", "y", [line], log=True)
+    (left, right), (low, high) = (drawn.layout[axis]["range"] for axis in ("xaxis", "yaxis"))
     assert left < -1 and right > 1 and -6 < low < -5 and 1 < high < 2
-    drawn = plotted(panel)
-    assert drawn["data"][0]["y"] == [1e-5, 10.0] and drawn["layout"]["yaxis"]["type"] == "log"
-    assert len(png(Figure("f", "f", "", (panel,)))) > 1000
+    assert [*drawn.data[0]["y"]] == [1e-5, 10.0] and drawn.layout["yaxis"]["type"] == "log"
+    assert len(png(Figure("f", "f", "", [drawn]))) > 1000
+
+
+def test_a_loss_is_drawn_by_its_cost_with_the_smallest_on_top():
+    dots = [
+        Dot(1, -100.0, "best", "a"),
+        Dot(2, np.nan, "model", "failed"),
+        Dot(3, 0.0, "best", "b"),
+    ]
+    drawn = panel("p", "x", "y", [], dots, [rule(-10.0, "accepted", "optimum")], loss=True)
+    bottom, top = drawn.layout["yaxis"]["range"]
+    assert bottom > 2 > 1 > top and drawn.layout["shapes"][0]["y0"] == 10.0
+    known, failed = (trace["y"] for trace in drawn.data)
+    assert [*known] == [100.0, 10.0] and failed[0] == pytest.approx(10.0**bottom)
+    assert all(float(t.replace("−", "-")) < 0 for t in drawn.layout["yaxis"]["ticktext"])
 
 
 @given(st.floats(-12, 6), st.floats(0.05, 12))
@@ -150,16 +157,19 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
     verdict = Verdict("several", ("delay:u", "dead_zone:u"), ("late", "dry"))
     found = Diagnosis(verdict, credit=(late, dry), prediction_error=(row,))
     share, worth = credit_figure(found, 1).panels
-    assert [(bar.label, bar.value) for bar in share.bars] == [
-        ("delay:u", 0.9),
-        ("dead_zone:u", 0.1),
-    ]
+    assert _bars(share) == [("delay:u", 0.9), ("dead_zone:u", 0.1)]
     assert worth.title.startswith("v")  # what predictions improved most
-    assert [bar.value for bar in worth.bars] == [0.5, 0.05, 0.4, 0.06, 0.04]
+    assert [value for _, value in _bars(worth)] == [0.5, 0.05, 0.4, 0.06, 0.04]
     later = replace(row, outset={"x": 0.7, "v": 1.4}, crude=row.with_effects)
     settled = replace(found, credit=(), prediction_error=(later,))
-    bars = credit_figure(settled).panels
-    assert [1.4, 0.05, 0.04] in [[bar.value for bar in one.bars] for one in bars]
+    lengths = [[value for _, value in _bars(one)] for one in credit_figure(settled).panels]
+    assert [1.4, 0.05, 0.04] in lengths
     (x, v) = accuracy_figure(found).panels
-    errors = sorted(float(curve.y[0]) for curve in x.curves)
+    errors = sorted(float(one["y"][0]) for one in x.curves)
     assert errors == [0.05, 0.1, 0.1, 0.2] and v.title.startswith("v")
+
+
+def _bars(panel):
+    """The label and the value of each bar, from the top."""
+    labels, (trace,) = panel.layout["yaxis"]["ticktext"], panel.data
+    return [*zip(labels[::-1], trace["x"][::-1].tolist(), strict=True)]

@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from facts import holding
-from grounded_trials.report.figures.paths import ended
 from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
@@ -35,8 +34,7 @@ def _entities(path: Path) -> str:
 
 
 ENTITIES = """
-/paths/model_policy /paths/best/body /paths/predicted /ahead/real/body /ahead/off/body
-/ahead/on/body /utilities /summary
+/paths/model_policy /paths/best/body /paths/predicted /utilities /summary /verdict
 """
 
 
@@ -56,28 +54,6 @@ def test_rerun_accepts_the_recording_and_finds_all_of_it(cart, tmp_path):
     for run in findings.runs:
         for part in ("path", "predicted", "body", "state", "input", "bias", "explained"):
             assert f"/trials/{run.trial.id}/{part}" in found
-
-
-@needs_tool
-def test_crashes_are_marked_where_and_when(car, tmp_path):
-    findings = gathered(car)
-    first, *rest = findings.runs
-    states, inputs = first.trial.states[:20], first.trial.inputs[:19]
-    cut = replace(first.trial, states=states, inputs=inputs)
-    short = replace(first, trial=cut, utility=-np.inf)
-    path = tmp_path / "crash.rrd"
-    write_recording(replace(findings, runs=(short, *rest)), path)
-    assert _rerun("rrd", "verify", path).returncode == 0
-    told = ended(short)
-    assert f"{19 * findings.task.dt:.2f} s of" in told
-    found, shown = _entities(path), _rerun("rrd", "print", "-vvv", path).stdout
-    assert told in shown and ended(rest[0]) not in shown
-    for at in (f"/paths/crashes/{first.trial.id}", f"/trials/{first.trial.id}/crash"):
-        assert f"{at} " in found
-        assert f"{at} ".replace(first.trial.id, rest[0].trial.id) not in found
-    assert f"/trials/{first.trial.id}/state/ended " in found
-    write_recording(findings, path)
-    assert "/crash" not in _entities(path) and "/ended" not in _entities(path)
 
 
 def test_a_recording_of_nothing_and_of_runs_with_gaps(tmp_path):

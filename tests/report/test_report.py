@@ -139,7 +139,7 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
         assert grounded("-C", folder, "ingest", path, "--data").code == 0
     done = grounded("-C", folder, "report", "--html", "--png", "--rrd", "--json")
     assert done.code == 0, done.err
-    names = ["paths", "data-t0001", "data-t0002", "residual", "autocorrelation"]
+    names = ["paths", "data-t0001", "data-t0002", "residual"]
     assert [Path(p).stem for p in done.json["paths"]["png"]] == names
     shown = Path(done.json["paths"]["html"]).read_text()
     assert re.search(r'<td>t0001</td>\s*<td class="text">crude', shown)

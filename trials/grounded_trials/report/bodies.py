@@ -3,9 +3,7 @@
     position                    a car from above, or an aircraft, along its path
     hanging, upright, level     a chain of links in a vertical plane: the angles of their joints,
                                 where the first is zero downwards, upwards, or along x
-    rail                        the position of a carriage that carries the links; with a speed,
-                                of the wheels of a vehicle that balances
-    altitude, without position  a cabin that moves up and down
+    rail                        the position of a carriage that carries the links
     a MuJoCo model              the geometry of its file
     none of these               a dot in the plane of the first two states
 
@@ -48,10 +46,8 @@ AIRCRAFT = (
     [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
 )
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
-LENGTH = 0.07  # size of a body of unknown length, as a fraction of the paths' size
+LENGTH = 0.07  # size of a vehicle, as a fraction of the paths' size
 SLIM = 0.06  # radius of a link, as a fraction of the longest link
-ROPE = 0.005  # radius of a crane's rope, as a fraction of the longest one
-LOAD = 0.05  # half edge of a crane's load, as a fraction of the longest rope
 CARRIAGE = (0.25, 0.12, 0.1)  # half edges of the carriage, as fractions of the links' length
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east, north, up
 
@@ -79,14 +75,9 @@ class Scene:
         found[:, : len(self.axes)] = states[:, list(self.axes)]
         return found
 
-    def finite(self, states: Array) -> Array:
-        """Return the finite positions (k, 3) of states."""
-        points = self.points(states)
-        return points[np.isfinite(points).all(axis=1)]
-
     def rotations(self, states: Array) -> Array:
         """Return body axes (nose, left, up) as the columns of rotation matrices (T, 3, 3)."""
-        from scipy.spatial.transform import Rotation
+        from scipy.spatial.transform import Rotation  # takes 0.1 s, for recordings alone
 
         if self.attitude:  # axes nose, right, down in the frame north, east, down
             turned = Rotation.from_euler("ZYX", states[:, list(self.attitude[::-1])]).as_matrix()
@@ -127,8 +118,8 @@ def scene_of(model: Model) -> Scene:
 def body_in(findings: Findings) -> Body:
     """Return the body of a workspace's model, in a size that is visible next to the path."""
     model = findings.task.model
-    scene, shown = scene_of(model), findings.runs or findings.logs
-    points = scene.finite(shown[0].trial.states if shown else findings.task.target)
+    scene, drawn = scene_of(model), findings.runs or findings.logs
+    points = finite(scene.points(drawn[0].trial.states if drawn else findings.task.target))
     size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     return body_of(model, scene, LENGTH * (size or 1.0))
 
@@ -139,22 +130,18 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
     Args:
         model: provides roles and parameters.
         scene: the position and orientation of the body.
-        size: length of a body of unknown length.
+        size: length of a vehicle.
     """
     own: Body | None = getattr(model.step, "body", None)  # provided by an adapter
     if own is not None:
         return own
+    roles = roles_of(model)
     for role, (zero, sign) in ZEROS.items():
-        if angles := _columns(model, role):
+        if angles := roles.get(role, []):
             lengths = _lengths(model, len(angles))
             unit = "m" if all(lengths) else ""
             drawn = tuple(length or 1.0 for length in lengths)
-            rail = _columns(model, "rail")
-            wide = min(CARRIAGE[0] * sum(drawn), size) if unit else CARRIAGE[0] * sum(drawn)
-            drives = bool(rail) and bool(_columns(model, "speed"))
-            return Links(angles, drawn, zero, sign, unit, rail, wide, drives)
-    if not scene.spatial and (height := _columns(model, "altitude")):
-        return Cabin(height[0], size, list(model.states.values())[height[0]])
+            return Links(tuple(angles), drawn, zero, sign, unit, tuple(roles.get("rail", [])))
     return Vehicle(scene, size)
 
 
@@ -163,10 +150,9 @@ def is_mechanism(body: Body) -> bool:
     return not isinstance(body, Vehicle)
 
 
-def _columns(model: Model, role: str) -> tuple[int, ...]:
-    named = model.roles.get(role, ())
-    names = (named,) if isinstance(named, str) else named
-    return tuple(model.state_names.index(name) for name in names if name in model.states)
+def finite(points: Array) -> Array:
+    """Return the finite ones of some points (T, 3)."""
+    return points[np.isfinite(points).all(axis=1)]
 
 
 def _lengths(model: Model, count: int) -> tuple[float, ...]:
@@ -184,7 +170,6 @@ class Vehicle:
 
     scene: Scene
     size: float
-    watched = "the position"
 
     @property
     def unit(self) -> str:
@@ -218,55 +203,24 @@ class Links:
     sign: int
     unit: str
     rail: tuple[int, ...] = ()  # index of the carriage's state, or empty
-    wide: float = CARRIAGE[0]  # half width of the carriage
-    drives: bool = False  # whether the carriage is a vehicle's wheels, as of a balancing robot
-
-    @property
-    def hangs(self) -> bool:
-        """Whether it is a load on ropes below a carriage, as of a crane."""
-        return bool(self.rail) and (self.zero, self.sign) == ZEROS["hanging"]
-
-    @property
-    def watched(self) -> str:
-        """The end of the last link; of a vehicle, whose link ends nowhere, its position."""
-        if self.drives:
-            return "the position"
-        return "the load" if self.hangs else "the tip"
 
     @property
     def parts(self) -> Sequence[Part]:
-        """The links or ropes, the load if there is one, then the carriage."""
-        longest = max(self.lengths)
-        thin = longest * (ROPE if self.hangs else SLIM)
-        links = [
-            Part(f"link{i}", "capsule", (thin, length)) for i, length in enumerate(self.lengths, 1)
-        ]
-        load = [Part("load", "box", (LOAD * longest,) * 3)] * self.hangs
-        size = tuple(self.wide / CARRIAGE[0] * part for part in CARRIAGE)
-        return [*links, *load, *[Part("carriage", "box", size)] * bool(self.rail)]
+        """The links, then the carriage."""
+        thin = SLIM * max(self.lengths)
+        links = [Part(f"link{i}", "capsule", (thin, one)) for i, one in enumerate(self.lengths, 1)]
+        size = tuple(part * sum(self.lengths) for part in CARRIAGE)
+        return [*links, *[Part("carriage", "box", size)] * bool(self.rail)]
 
     def poses(self, states: Array) -> list[Pose]:
-        """Return the pose of each link at its joint, with z along it; the load's, the carriage's.
-
-        The load turns with the rope that it hangs on.
-        """
+        """Return the pose of each link at its joint, with z along it; then the carriage's."""
         joints, along = self._chain(states)
-        found: list[Pose] = []
-        for joint, angle in zip(joints, along, strict=False):
-            cos, sin, no = np.cos(angle), np.sin(angle), np.zeros(len(angle))
-            columns = [(sin, no, -cos), (no, no + 1, no), (cos, no, sin)]
-            turned = np.stack([np.stack(c, axis=-1) for c in columns], axis=-1)
-            found.append((joint, turned))
-        load = [(joints[-1], found[-1][1])] * self.hangs
+        turned = [_upright(angle) for angle in along]
         still = np.tile(np.eye(3), (len(states), 1, 1))
-        return [*found, *load, *[(joints[0], still)] * bool(self.rail)]
+        found: list[Pose] = list(zip(joints, turned, strict=False))
+        return [*found, *[(joints[0], still)] * bool(self.rail)]
 
     def path(self, states: Array) -> Array:
-        """Return the positions of the watched point (T, 3)."""
-        chain = self._chain(states)[0]
-        return chain[0] if self.drives else chain[-1]
-
-    def end(self, states: Array) -> Array:
         """Return the positions of the last link's end (T, 3)."""
         return self._chain(states)[0][-1]
 
@@ -283,39 +237,18 @@ class Links:
         return joints, list(turned.T)
 
 
-@dataclass(frozen=True, eq=False)
-class Cabin:
-    """A cabin that moves up and down."""
-
-    height: int  # index of the state
-    size: float
-    unit: str
-    watched = "its middle"
-
-    @property
-    def parts(self) -> Sequence[Part]:
-        """A box."""
-        return (Part("cabin", "box", (self.size, self.size, 1.4 * self.size)),)
-
-    def poses(self, states: Array) -> list[Pose]:
-        """Return its pose at its height."""
-        return [(self.path(states), np.tile(np.eye(3), (len(states), 1, 1)))]
-
-    def path(self, states: Array) -> Array:
-        """Return the positions of its middle (T, 3)."""
-        found = np.zeros((len(states), 3))
-        found[:, 2] = states[:, self.height]
-        return found
+def _upright(angle: Array) -> Array:
+    """Return rotation matrices (T, 3, 3) that turn z to an angle from x to z (T,)."""
+    cos, sin, no = np.cos(angle), np.sin(angle), np.zeros(len(angle))
+    rows = [(sin, no, cos), (no, no + 1, no), (-cos, no, sin)]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def reach(body: Body, states: Array) -> Array:
     """Return points (k, 3) that a body reaches in the finite ones of some states."""
     path = body.path(states)
     known = states[np.isfinite(path).all(axis=1)]
-    filled = np.where(np.isfinite(known), known, 0.0)
     if not len(known) or not is_mechanism(body):
-        return path[np.isfinite(path).all(axis=1)]
-    chosen = filled[np.unique(np.linspace(0, len(filled) - 1, 60).astype(int))]
-    origins = [origin for origin, _ in body.poses(chosen)]
-    ends = [body.end(chosen)] if isinstance(body, Links) and body.drives else []
-    return np.vstack([path[np.isfinite(path).all(axis=1)], *origins, *ends])
+        return finite(path)
+    chosen = np.nan_to_num(known[np.unique(np.linspace(0, len(known) - 1, 60).astype(int))])
+    return np.vstack([finite(path), *(origin for origin, _ in body.poses(chosen))])

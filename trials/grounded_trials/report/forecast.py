@@ -38,18 +38,6 @@ class Forecast:
         gap = np.full((len(values), 1), np.nan)
         return np.maximum.accumulate(steps) * dt, np.hstack([values, gap]).reshape(-1)
 
-    def along(self, trial: Trial) -> Array:
-        """Return the forecast states (T + 1, n) along the trial; NaN where there is no forecast.
-
-        At a step where one rollout ends and the next one starts, the value is that of the end.
-        """
-        found = np.full_like(trial.states, np.nan)
-        found[self.steps[:, 0]] = self.states[:, 0]
-        for k in range(1, self.steps.shape[1]):
-            known = self.steps[:, k] >= 0
-            found[self.steps[known, k]] = self.states[known, k]
-        return found
-
 
 def forecast(
     planner: Planner, trial: Trial, seconds: float = SECONDS, every: int = 0

@@ -10,8 +10,6 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
 from grounded.diagnosis.telling import error_table as held_out_table
@@ -55,12 +53,6 @@ from grounded_trials.workspace.next_step import DIAGNOSE
 
 OPEN = 12  # largest number of candidates whose table is shown unfolded
 UNKNOWN = "–"
-TERMS = {  # tables of [reward]
-    "state": "states",
-    "terminal": "end",
-    "input": "inputs",
-    "input_change": "input changes",
-}
 
 
 @dataclass(frozen=True)
@@ -177,11 +169,10 @@ def _utility(findings: Findings) -> list[Block]:
         return []
     gain = last_gain(findings.history)
     sure = gain.to_finding().sentence if gain else ""
-    terms, wide = _terms(findings), len(findings.history) <= OPEN
+    wide = len(findings.history) <= OPEN
     return [
         *_drawn(search_figure(findings.standing, findings.optimum)),
         *([Block("text", f"{begun(sure)}.")] if sure else []),
-        *([terms] if len(terms.rows) > 2 else []),
         Block("folded", "All candidates", blocks=_candidates(findings), wide=wide),
     ]
 
@@ -201,12 +192,8 @@ def _gap(findings: Findings) -> list[Block]:
     proof = _drawn(accuracy_figure(diagnosis), title=True)
     proof += _drawn(credit_figure(diagnosis), title=True)
     found = [verdict, *proof, *ahead, *lacking, *_drawn(where_figure(diagnosis), title=True)]
-    alike = [(one.effect, one.like, percent(one.share)) for one in diagnosis.lookalikes]
     found += _titled("Errors of held-out predictions", "held-out", *held_out_table(diagnosis))
-    found += _effects(diagnosis, findings.since.adopted)
-    names = ("claimed effect", "look-alike ", "share")
-    found += _titled("Look-alikes", "lookalikes", alike, names)
-    return found + _by_trial(diagnosis) + _leftover(diagnosis)
+    return found + _effects(diagnosis, findings.since.adopted)
 
 
 def _titled(
@@ -219,7 +206,7 @@ def _titled(
 def _task(findings: Findings) -> list[Block]:
     words = f"Adopted: {', '.join(findings.effects) or 'none'}."
     parameters = Block("folded", "Parameters", blocks=parameter_table(findings))
-    return [Block("text", words), _channels(findings), parameters]
+    return [Block("text", words), parameters]
 
 
 # tables
@@ -240,19 +227,6 @@ def _candidates(findings: Findings) -> list[Block]:
     more = [Block("text", f"{left} more"), Block("command", status, "c-status")] * bool(left)
     why = legend("", [t.candidate.iteration for t in kept])
     return [made, *([Block("soft", f"{begun(why)}.")] if why else []), *more]
-
-
-def _terms(findings: Findings) -> Block:
-    """Return the compared utilities by terms of the reward."""
-    task, runs = findings.task, [run for _, run in compared(findings)]
-    each = [[task.terms(one.trial) for one in findings.runs_of(run.candidate.id)] for run in runs]
-    rows = [
-        (words, *(figure(float(np.mean([terms[name] for terms in own]))) for own in each))
-        for name, words in TERMS.items()
-        if each and name in each[0][0]
-    ]
-    rows.append(("utility", *(figure(run.utility) for run in runs)))
-    return table("terms", ("term of the reward ", *(run.candidate.id for run in runs)), rows)
 
 
 def error_table(findings: Findings) -> list[Block]:
@@ -320,40 +294,6 @@ def _effects(diagnosis: Diagnosis, adopted: Collection[str]) -> list[Block]:
     return [Block("heading", "Effects that were compared"), made] if rows else []
 
 
-def _by_trial(diagnosis: Diagnosis) -> list[Block]:
-    """Whether every trial asks for the same value, all other values held."""
-    found, units = diagnosis.per_trial, dict[tuple[str, str], str]()
-    for row in diagnosis.ranking:
-        units |= {(row.effect, name): e.unit for name, e in row.params.items()}
-    rows = []
-    for p in found:
-        own = diagnosis.parameters.get(p.quantity)
-        unit = own.unit if own else units.get((p.effect, p.quantity), "")
-        value = Estimate(p.value, p.std, unit=unit).text
-        rows.append((p.effect, p.quantity, p.trial, value, "yes" if p.agrees else "no"))
-    header = ("effect", "quantity ", "trial ", "value", "agrees")
-    strong = [i for i, p in enumerate(found) if not p.agrees]
-    each = table("per-trial", header, rows, strong)
-    return [Block("folded", "Trial by trial", blocks=[each], wide=bool(strong))] * bool(found)
-
-
-def _leftover(diagnosis: Diagnosis) -> list[Block]:
-    """Return the residuals that a flexible model finds and no known effect explains."""
-    rows = [
-        (
-            left.channel,
-            with_unit(figure(left.size, 3), left.unit),
-            "-" if left.region is None else left.region.told,
-            "-" if left.region is None else percent(left.region.share),
-            figure(left.evidence, 3),
-        )
-        for left in diagnosis.leftover
-        if math.isfinite(left.size)
-    ]
-    header = ("channel", "missing rate, rms", "mostly where ", "share there", "evidence [nats]")
-    return _titled("What no known effect explains", "leftover", rows, header)
-
-
 def parameter_table(findings: Findings) -> list[Block]:
     """Return the model's parameters: in model.py, current, and as diagnosed."""
     estimated = _estimated(findings.diagnosis)
@@ -393,21 +333,6 @@ def _interval(v: Estimate) -> str:
     known = low <= v.value <= high and v.known
     low, high = extent(low, high)
     return f"{figure(value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
-
-
-def _channels(findings: Findings) -> Block:
-    """Return states and inputs with units, weights, limits and latency."""
-    task, reward, rows = findings.task, findings.task.reward, []
-    assert task.latency is not None
-    for i, (name, unit) in enumerate(task.model.states.items()):
-        weight = f"{reward.state[i]:g}"
-        weight += f", terminal {reward.terminal[i]:g}" if reward.terminal[i] else ""
-        rows.append((name, "state", shown(unit), weight, "-", "-"))
-    for j, (name, unit) in enumerate(task.model.inputs.items()):
-        weight = f"{reward.input[j]:g}, change {reward.input_change[j]:g}"
-        delay = f"{task.latency[j]:g} s" if task.latency[j] else "-"
-        rows.append((name, "input", shown(unit), weight, _range(task.low[j], task.high[j]), delay))
-    return table("channels", ("name", "kind", "unit", "weight", "limits", "latency"), rows)
 
 
 def _range(low: float | None, high: float | None) -> str:

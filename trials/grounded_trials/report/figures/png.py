@@ -6,28 +6,25 @@ import io
 import textwrap
 from typing import Any
 
-import numpy as np
-
 from grounded.errors import needs
-from grounded.figures.figure import Bars, Figure, Key, Panel, typeset
-from grounded.figures.interactive import key_trace, palette, plotted
+from grounded.figures.figure import Figure, Key, Panel, Trace, key_trace, typeset
+from grounded.figures.interactive import PALETTE
 
 WIDE, HIGH, SQUARE = 4.8, 2.7, 4.4  # [inch] of a panel
 HEAD, ROW = 0.5, 0.27  # [inch] of a title above bars, and of a bar
-POSES = 6  # drawn poses of a moving body
 DPI = 200
 MARKERS = {"circle": "o", "circle-open": "o", "x-thin": "x", "line-ew": "_"}
 LINE, MARK = 0.8, 0.7  # points of a pixel of a line's width, and of a mark's size
-TITLE = 52  # characters per line of a panel's title
-CAPTION, PER_INCH = 8.0, 17.0  # size of a caption [pt], and its characters per inch
-NOTE, NOTE_SIZE = 68, 8.0  # characters per line of a panel's note, and its size [pt]
+TITLE, NOTE = 52, 68  # characters per line of a panel's title and note
+SMALL = 8.0  # size of captions and notes [pt]
+PER_INCH = 17.0  # characters of a caption
 OTHERS = 3  # largest number of single trials named in a legend
 STYLE: Any = {
     "font.size": 9.0, "axes.titlesize": 9.5, "axes.titleweight": "bold",
     "axes.titlelocation": "left", "axes.grid": True, "axes.axisbelow": True,
     "grid.color": "#e3e3e3", "axes.edgecolor": "#bbbbbb",
     "axes.spines.top": False, "axes.spines.right": False, "text.parse_math": False,
-    "legend.frameon": False, "figure.constrained_layout.use": True, "svg.hashsalt": "grounded",
+    "legend.frameon": False, "figure.constrained_layout.use": True,
 }  # fmt: skip
 
 
@@ -43,7 +40,7 @@ def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIG
         GroundedError: if matplotlib is not installed.
     """
     needs("matplotlib", "png")
-    from matplotlib import rc_context, rcParams
+    from matplotlib import rc_context
     from matplotlib.figure import Figure as Sheet
     from matplotlib.lines import Line2D
 
@@ -53,40 +50,31 @@ def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIG
     heights = [max(_height(panel, size[1]) for panel in row) for row in rows] or [1.0]
     with rc_context(STYLE):
         wide = max(columns, 1.6) * size[0]
-        caption = textwrap.fill(figure.caption, round(wide * PER_INCH))
-        below = CAPTION / 72 * 1.3 * len(caption.splitlines())
+        caption = typeset(textwrap.fill(figure.caption, round(wide * PER_INCH)))
+        below = SMALL / 72 * 1.3 * len(caption.splitlines())
         sheet = Sheet(figsize=(wide, sum(heights) + 0.9 + below), dpi=DPI)
         sheet.suptitle(figure.title, x=0.01, ha="left", fontsize=12.0)
         grid = sheet.add_gridspec(len(heights), columns, height_ratios=heights)
         for i, row in enumerate(rows):
             for j, panel in enumerate(row):
-                axes = sheet.add_subplot(grid[i, j])
-                note = "" if isinstance(panel, Bars) else textwrap.fill(panel.note, NOTE)
-                room = 1.2 * NOTE_SIZE * (note.count("\n") + 1) if note else 0.0
-                title = typeset(textwrap.fill(panel.title, TITLE))
-                axes.set_title(title, pad=rcParams["axes.titlepad"] + room)
-                axes.annotate(
-                    typeset(note), (0, 1), (0, 3), "axes fraction", "offset points",
-                    fontsize=NOTE_SIZE, va="bottom",
-                )  # fmt: skip
-                _draw(axes, panel, most=round((heights[i] - HEAD) / ROW))
+                _draw(sheet.add_subplot(grid[i, j]), panel, heights[i])
         handles = [Line2D([], [], label=key.name, **_look(key_trace(key))) for key in _keys(figure)]
         if handles:
             sheet.legend(
                 handles=handles, loc="outside lower left", ncols=columns + 1, alignment="left",
-                title=typeset(caption) or None, title_fontsize=CAPTION,
+                title=caption or None, title_fontsize=SMALL,
             )  # fmt: skip
         elif caption:
-            sheet.supxlabel(typeset(caption), x=0.01, ha="left", fontsize=CAPTION)
+            sheet.supxlabel(caption, x=0.01, ha="left", fontsize=SMALL)
         stream = io.BytesIO()
         sheet.savefig(stream, format="png", metadata={"Software": None})
     return stream.getvalue()
 
 
-def _height(panel: Panel | Bars, usual: float) -> float:
-    if isinstance(panel, Bars):
-        return HEAD + ROW * max(len(panel.bars), 1)
-    return SQUARE if panel.equal else usual
+def _height(panel: Panel, usual: float) -> float:
+    if panel.kind == "bars":
+        return HEAD + ROW * len(panel.data[0]["y"])
+    return SQUARE if "scaleanchor" in panel.layout["yaxis"] else usual
 
 
 def _keys(figure: Figure) -> list[Key]:
@@ -98,46 +86,50 @@ def _keys(figure: Figure) -> list[Key]:
     return [*kept, Key(single[0].role, f"{len(single)} other trials")]
 
 
-def _draw(axes: Any, panel: Panel | Bars, most: int) -> None:
-    """Draw a panel; bars as thick as those of the panel with the `most` bars in the same row."""
-    found = plotted(panel)
-    layout: dict[str, Any] = found["layout"]
+def _draw(axes: Any, panel: Panel, height: float) -> None:
+    """Draw a panel into axes of a height [inch], which makes bars of one row equally thick."""
+    # the title, and the note between it and the axes
+    note = typeset(textwrap.fill(panel.note, NOTE))
+    room = 1.2 * SMALL * (note.count("\n") + 1) if note else 0.0
+    axes.set_title(typeset(textwrap.fill(panel.title, TITLE)), pad=6.0 + room)
+    axes.annotate(
+        note, (0, 1), (0, 3), "axes fraction", "offset points", fontsize=SMALL, va="bottom"
+    )
+
+    # the contents
+    layout = panel.layout
     for shape in layout.get("shapes", ()):
-        ends = np.clip((shape["y0"], shape["y1"]), *layout["yaxis"]["range"])
         if shape["type"] == "rect":
-            axes.axhspan(*ends, color=_colour(shape["fillcolor"]), lw=0)
+            axes.axhspan(shape["y0"], shape["y1"], color=_colour(shape["fillcolor"]), lw=0)
         else:
             axes.axhline(shape["y0"], **_look(shape))
-    for trace in found["data"]:
+    for trace in panel.data:
         if trace["type"] == "bar":
-            colours = [_colour(role) for role in trace["marker"]["color"]]
-            drawn = axes.barh(trace["y"], trace["x"], color=colours)
+            drawn = axes.barh(
+                trace["y"], trace["x"], color=[*map(_colour, trace["marker"]["color"])]
+            )
             axes.bar_label(drawn, trace["text"], padding=3)
         elif trace.get("visible", True):
             _trace(axes, trace)
+
+    # the axes
+    equal = "scaleanchor" in layout["yaxis"]
     for name in ("x", "y"):
-        _axis(axes, name, layout[f"{name}axis"], "scaleanchor" in layout["yaxis"])
-    if isinstance(panel, Bars):
-        axes.set_ylim(len(panel.bars) - max(most, len(panel.bars)) - 0.5, len(panel.bars) - 0.5)
+        _axis(axes, name, layout[f"{name}axis"], grows=equal)
+    if equal:
+        axes.set_aspect("equal", adjustable="datalim")
+    if panel.kind == "bars":
+        count = len(panel.data[0]["y"])
+        axes.set_ylim(count - max(round((height - HEAD) / ROW), count) - 0.5, count - 0.5)
         axes.xaxis.set_visible(False)
         axes.grid(False)
         axes.tick_params(left=False)
         axes.spines["bottom"].set_visible(False)
-        return
-    if panel.equal:
-        axes.set_aspect("equal", adjustable="datalim")
-    for curve in panel.curves:
-        if curve.motion is not None and curve.trial and curve.role != "other" and curve.name:
-            for row in np.linspace(0, len(curve.motion.times) - 1, POSES).astype(int):
-                for line, thick in curve.motion.lines(row):
-                    width = 4.0 if thick else 1.0
-                    axes.plot(*line.T, color=_colour(f"@{curve.role}/0.25"), lw=width)
 
 
 def _axis(axes: Any, name: str, axis: dict[str, Any], grows: bool) -> None:
     """Set the range (that `grows` if needed), the ticks and the title of an axis."""
-    set_ticks = getattr(axes, f"set_{name}ticks")
-    ends = axis.get("range", ())
+    set_ticks, ends = getattr(axes, f"set_{name}ticks"), axis.get("range", ())
     if axis.get("type") == "log":
         getattr(axes, f"set_{name}scale")("log")
         set_ticks([], minor=True)
@@ -146,7 +138,7 @@ def _axis(axes: Any, name: str, axis: dict[str, Any], grows: bool) -> None:
         set_ticks(axis["tickvals"], [text.replace("<br>", "\n") for text in axis["ticktext"]])
     if ends:
         getattr(axes, f"set_{name}lim")(ends, auto=grows)
-    if "dtick" in axis:
+    if "dtick" in axis and "tickvals" not in axis:
         from matplotlib.ticker import MaxNLocator
 
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -154,23 +146,16 @@ def _axis(axes: Any, name: str, axis: dict[str, Any], grows: bool) -> None:
         getattr(axes, f"set_{name}label")(typeset(axis["title"]["text"]))
 
 
-def _trace(axes: Any, trace: dict[str, Any]) -> None:
-    """Draw a trace: a line, marks, or a line whose points are coloured by a value."""
-    x, y, marker = trace["x"], trace["y"], trace.get("marker", {})
-    if "colorbar" in marker:
-        look = _look(trace | {"mode": "lines"})
-        axes.plot(x, y, **look)
-        drawn = axes.scatter(x, y, c=marker["color"], s=9, cmap="cividis", zorder=3)
-        label = marker["colorbar"]["title"]["text"]
-        axes.figure.colorbar(drawn, ax=axes, label=label, shrink=0.8)
-        return
+def _trace(axes: Any, trace: Trace) -> None:
+    """Draw a line or marks, with their errors."""
+    x, y = trace["x"], trace["y"]
     if error := trace.get("error_y"):
-        ends = (error["arrayminus"], error["array"])
-        axes.errorbar(x, y, ends, fmt="none", ecolor=_colour(error["color"]), elinewidth=1.2)
+        look = {"ecolor": _colour(error["color"]), "elinewidth": 1.2}
+        axes.errorbar(x, y, error["array"], fmt="none", **look)
     axes.plot(x, y, clip_on=trace.get("cliponaxis", True), **_look(trace))
 
 
-def _look(trace: dict[str, Any]) -> dict[str, Any]:
+def _look(trace: Trace) -> dict[str, Any]:
     """Return the look of a trace, of a legend's entry or of a rule for matplotlib."""
     mode, line, marker = trace.get("mode", "lines"), trace.get("line", {}), trace.get("marker", {})
     look: dict[str, Any] = {"ls": "none"}
@@ -195,4 +180,4 @@ def _colour(role: str) -> tuple[float, ...]:
     from matplotlib.colors import to_rgba
 
     name, _, opacity = role[1:].partition("/")
-    return to_rgba(palette()[name][0], float(opacity or 1))
+    return to_rgba(PALETTE[name][0], float(opacity or 1))

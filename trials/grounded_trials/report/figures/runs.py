@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from grounded.diagnosis.pictures import gap_figures
 from grounded.figures.figure import (
     STEPS,
-    Curve,
     Dot,
     Figure,
     Key,
     Panel,
-    Rule,
+    Trace,
+    curve,
     fitted,
     legend,
+    panel,
+    rule,
     without_astray,
 )
 from grounded.frozen import Array
@@ -56,20 +57,15 @@ def all_figures(findings: Findings) -> list[Figure]:
 
 
 def _compared(
-    findings: Findings, values: Callable[[Run], Array], column: int
-) -> tuple[list[Curve], list[Dot]]:
+    findings: Findings, values: Callable[[Run], Array], column: int, style: str = "line"
+) -> tuple[list[Trace], list[Dot]]:
     """Return a column of each compared run's values, with crosses where the run ended early."""
-    shown, dt = compared(findings), findings.task.dt
-    drawn = [values(run)[:, column] for _, run in shown]
-    curves = [
-        _over_time(each, dt, role, name_of(role, run))
-        for each, (role, run) in zip(drawn, shown, strict=True)
-    ]
-    dots = []
-    for each, (role, run) in zip(drawn, shown, strict=True):
+    curves, dots, dt = list[Trace](), list[Dot](), findings.task.dt
+    for role, run in compared(findings):
+        each, name = values(run)[:, column], name_of(role, run)
+        curves.append(_over_time(each, dt, role, name, style=style))
         if (last := crash(run)) is not None:
-            note = f"{name_of(role, run)} ended early"
-            dots.append(Dot(last * dt, float(each[last]), role, note, "cross"))
+            dots.append(Dot(last * dt, float(each[last]), role, f"{name} ended early", "cross"))
     return curves, dots
 
 
@@ -97,7 +93,7 @@ def state_figure(findings: Findings) -> Figure | None:
             end = (Key("desired", DESIRED_END, "ring"),)
         note = ESTIMATED * (name in findings.estimated)
         panels.append(_timed(name, unit, curves, marks=marks, note=note))
-    return Figure("states", "States over time", "", tuple(panels), (*legend(panels), *end))
+    return Figure("states", "States over time", "", panels, (*legend(panels), *end))
 
 
 def error_figure(findings: Findings) -> Figure | None:
@@ -123,7 +119,7 @@ def error_figure(findings: Findings) -> Figure | None:
         gap, words = prediction_error(task, run)[:, i], f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
         panels.append(_timed(f"{name} − target", unit, curves, spare=50.0, marks=marks))
-    return Figure("error", "Tracking error", "", tuple(panels), legend(panels))
+    return Figure("error", "Tracking error", "", panels, legend(panels))
 
 
 def input_figure(findings: Findings) -> Figure | None:
@@ -132,17 +128,16 @@ def input_figure(findings: Findings) -> Figure | None:
     if not compared(findings):
         return None
     for j, (name, unit) in enumerate(task.model.inputs.items()):
-        held = _compared(
-            findings, lambda run: np.vstack([run.trial.inputs, run.trial.inputs[-1:]]), j
-        )[0]
-        curves = [replace(curve, style="steps") for curve in held]
+        curves, _ = _compared(
+            findings, lambda run: np.vstack([run.trial.inputs, run.trial.inputs[-1:]]), j, "steps"
+        )
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
-        sent, note = [curve.y for curve in curves], ""
+        sent, note = [each["y"] for each in curves], ""
         if np.ptp(fitted(sent)) < FLAT * np.ptp(fitted([*sent, np.array(limits)])):
             ends = listed(f"{v:g}" for v in limits).replace("-", "−")
             note, limits = f"limit{'s' * (len(limits) > 1)} {with_unit(ends, unit)}", []
         panels.append(_timed(name, unit, curves, limits, note=note))
-    return Figure("inputs", "Inputs", "", tuple(panels), legend(panels))
+    return Figure("inputs", "Inputs", "", panels, legend(panels))
 
 
 def bias_figure(findings: Findings) -> Figure | None:
@@ -166,22 +161,29 @@ def bias_figure(findings: Findings) -> Figure | None:
         curves = []
         for values, role, words, width in drawn:
             mean = averaged(values[:, i] / task.dt, window)
-            curve = _over_time(mean, window * task.dt, role, words, width)
-            curves.append(replace(curve, x=curve.x + middle))
+            curves.append(_over_time(mean, window * task.dt, role, words, width, middle))
         note = f"means: {window * task.dt:.2g} s" * (window > 1)
         panels.append(_timed(name, per_second(unit), curves, note=note))
-    return Figure("bias", "Bias", "", tuple(panels), legend(panels))
+    return Figure("bias", "Bias", "", panels, legend(panels))
 
 
-def _over_time(values: Array, dt: float, role: str, name: str, width: float = 1.5) -> Curve:
-    times: Array = np.arange(len(values), dtype=np.float64) * dt
-    return Curve(times, values, role, name, width)
+def _over_time(
+    values: Array,
+    dt: float,
+    role: str,
+    name: str,
+    width: float = 1.5,
+    start: float = 0.0,
+    style: str = "line",
+) -> Trace:
+    times: Array = start + np.arange(len(values), dtype=np.float64) * dt
+    return curve(times, values, role, name, width, style=style)
 
 
 def _timed(
     name: str,
     unit: str,
-    curves: list[Curve],
+    curves: Sequence[Trace],
     limits: Sequence[float] = (),
     spare: float = 3.0,
     marks: Sequence[Dot] = (),
@@ -192,22 +194,21 @@ def _timed(
     If that run is cut off, its note states the values that it reaches.
     """
     asked = [dot.y for dot in marks if dot.role == "desired"]
-    calm = [c.y for c in curves if c.role != "model"] + [np.array([*limits, *asked])]
-    wild = [c.y for c in curves if c.role == "model"]
+    calm = [c["y"] for c in curves if c["meta"]["role"] != "model"] + [np.array([*limits, *asked])]
+    wild = [c["y"] for c in curves if c["meta"]["role"] == "model"]
     finite = [v[np.isfinite(v)] for v in calm]
     moves = any(len(v) and v.max() > v.min() for v in finite)  # else: a constant target
-    values = without_astray(calm, wild, spare) if moves else [*calm, *wild]
-    low, high = fitted(values)
+    low, high = fitted(without_astray(calm, wild, spare) if moves else [*calm, *wild])
     all_low, all_high = fitted([*calm, *wild])
     if all_high - all_low <= CUT * (high - low):
         low, high = all_low, all_high
-    return Panel(
+    return panel(
         labelled(name, unit),
         "time [s]",
         shown(unit),
-        tuple(curves),
-        tuple(marks),
-        rules=tuple(Rule(v, "limit", "limit") for v in limits),
+        curves,
+        marks,
+        [rule(v, "limit", "limit") for v in limits],
         y_range=(low, high),
         note="; ".join(filter(None, (_cut_off(wild, low, high), note))),
         kind="time",

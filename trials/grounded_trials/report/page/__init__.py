@@ -23,9 +23,8 @@ import numpy as np
 from grounded.diagnosis.pictures import credit_figure
 from grounded.diagnosis.telling import FINDINGS, instrument_lines, sentence
 from grounded.errors import needs
-from grounded.figures.body import Motion
-from grounded.figures.figure import Bars, Panel, typeset
-from grounded.figures.interactive import label_lines, packed, palette, plotted
+from grounded.figures.figure import Panel, label_lines, typeset
+from grounded.figures.interactive import PALETTE, packed
 from grounded_trials.report.findings import Findings
 from grounded_trials.report.tables import about, counted, improved, sections
 from grounded_trials.wording import glued, placed, rendered
@@ -47,12 +46,12 @@ def page(findings: Findings) -> str:
     scripts = [_own("plotly-basic.min.js"), _own("page.js")]
     panels: list[dict[str, Any]] = []
 
-    def number(panel: Panel | Bars) -> int:
+    def number(panel: Panel) -> int:
         panels.append(_data(panel))
         return len(panels) - 1
 
     def data() -> str:  # called after all panels have been numbered
-        text = json.dumps({"panels": panels, "colours": palette()}, allow_nan=False)
+        text = json.dumps({"panels": panels, "colours": PALETTE}, allow_nan=False)
         return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
     return jinja.from_string(_own("page.html")).render(
@@ -104,28 +103,8 @@ def _hash(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def _data(panel: Panel | Bars) -> dict[str, Any]:
-    kind = "bars" if isinstance(panel, Bars) else panel.kind
-    found: dict[str, Any] = _plain(plotted(panel))
-    if not isinstance(panel, Bars) and any(curve.motion for curve in panel.curves):
-        found["motions"] = [_motion(curve.motion) for curve in panel.curves]
-    return found | {"kind": kind}
-
-
-def _motion(motion: Motion | None) -> dict[str, Any] | None:
-    """Return a motion as data for the script: eight numbers over time for each part."""
-    if motion is None:
-        return None
-    rows = motion.poses.reshape(*motion.poses.shape[:2], 8)
-    parts = [
-        {
-            "strips": [strip.tolist() for strip in strips],
-            "thick": thick,
-            "pose": [packed(v) if np.ptp(v) else float(v[0]) for v in rows[:, k].T],
-        }
-        for k, (strips, thick) in enumerate(motion.wires)
-    ]
-    return {"t": packed(motion.times), "parts": parts}
+def _data(panel: Panel) -> dict[str, Any]:
+    return {"kind": panel.kind, "data": _plain(panel.data), "layout": _plain(panel.layout)}
 
 
 def _plain(value: Any) -> Any:
@@ -139,17 +118,18 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, np.floating) else typeset(value)
 
 
-def _height(panel: Panel | Bars) -> int:
+def _height(panel: Panel) -> int:
     """Return the height of a panel in the page [px]."""
-    if isinstance(panel, Bars):
-        return 30 + max(26, 16 * label_lines(panel)) * max(len(panel.bars), 1)
+    if panel.kind == "bars":
+        return 30 + max(26, 16 * label_lines(panel)) * len(panel.data[0]["y"])
     return 420 if panel.kind == "path" else 240
 
 
 def _roles() -> str:
     """Return the style of the roles' colours, light and dark; print uses light."""
-    light = "".join(f".{role}{{--c:{pair[0]}}}" for role, pair in palette().items())
-    dark = "".join(f".{role}{{--c:{pair[1]}}}" for role, pair in palette().items())
+    light, dark = (
+        "".join(f".{role}{{--c:{pair[k]}}}" for role, pair in PALETTE.items()) for k in (0, 1)
+    )
     return f"{light}@media screen and (prefers-color-scheme: dark){{{dark}}}"
 
 

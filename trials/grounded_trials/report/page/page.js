@@ -11,13 +11,8 @@
   let time = 0;
 
   // Values: decode typed arrays, replace roles by colours.
-  const array = ({ dtype, bdata, from, step }) => {
-    const bytes = Uint8Array.from(atob(bdata), (c) => c.charCodeAt(0));
-    if (dtype === "u2") {
-      return Float64Array.from(new Uint16Array(bytes.buffer), (n) => n === 65535 ? NaN : from + step * n);
-    }
-    return dtype === "f4" ? new Float32Array(bytes.buffer) : new Float64Array(bytes.buffer);
-  };
+  const array = ({ bdata }) =>
+    new Float32Array(Uint8Array.from(atob(bdata), (c) => c.charCodeAt(0)).buffer);
   const unpacked = (value) => {
     if (Array.isArray(value)) return value.map(unpacked);
     if (value === null || typeof value !== "object") return value;
@@ -42,7 +37,7 @@
   const known = (plot) => {
     const panel = panels[plot.dataset.panel];
     if (!panel.ready) {
-      for (const key of ["data", "layout", "motions"]) panel[key] = unpacked(panel[key] || []);
+      for (const key of ["data", "layout"]) panel[key] = unpacked(panel[key] || []);
       panel.ready = true;
       panel.home = [...panel.layout.xaxis.range];
     }
@@ -197,38 +192,6 @@
     const now = between(t), place = now && [now(x), now(y)];
     return place && place.every(Number.isFinite) ? place : null;
   };
-  // A mechanism seen from the side: the lines of its parts in their pose at the cursor's time.
-  const SVG = "http://www.w3.org/2000/svg";
-  const body = (plot, name, motion) => {
-    const { xaxis, yaxis } = plot._fullLayout, now = motion && between(motion.t);
-    let drawn = plot.querySelector(":scope > svg.body");
-    if (!drawn) {
-      drawn = document.createElementNS(SVG, "svg");
-      drawn.setAttribute("class", "over body");
-      for (const [one] of parts) {
-        const group = document.createElementNS(SVG, "g");
-        group.setAttribute("class", one);
-        drawn.append(group);
-      }
-      plot.append(drawn);
-    }
-    Object.assign(drawn.style, {
-      left: `${xaxis._offset}px`, top: `${yaxis._offset}px`,
-      width: `${xaxis._length}px`, height: `${yaxis._length}px`,
-    });
-    const scale = Math.abs(xaxis.l2p(1) - xaxis.l2p(0));
-    const lines = !now ? [] : motion.parts.flatMap(({ strips, thick, pose }) => {
-      const [a, b, c, x, d, e, f, z] = pose.map((v) => typeof v === "number" ? v : now(v));
-      return strips.map((strip) => {
-        const line = document.createElementNS(SVG, "path");
-        line.setAttribute("d", "M" + strip.map(([u, v, w]) =>
-          `${xaxis.l2p(x + a * u + b * v + c * w)} ${yaxis.l2p(z + d * u + e * v + f * w)}`).join("L"));
-        line.setAttribute("stroke-width", Math.max(2, thick * scale));
-        return line;
-      });
-    });
-    drawn.querySelector(`.${name}`).replaceChildren(...lines);
-  };
   const which = document.getElementById("which");
   const parts = [
     ["desired", "over at mark cross desired", ({ meta }) => meta.role === "desired"],
@@ -236,7 +199,7 @@
     ["real", "over at mark disc real", ({ meta }) => meta.trial === which.value && meta.style === "line"],
   ];
   const marks = (plot) => {
-    const { kind, data, motions } = known(plot);
+    const { kind, data } = known(plot);
     if (!plot._fullLayout || !which) return;
     if (kind === "time") put(plot, over(plot, "time", "over line"), time);
     if (kind !== "path" || !data.some((trace) => trace.meta.trial === which.value)) return;
@@ -244,7 +207,6 @@
       const trace = data.find((one) => fits(one) && one.customdata);
       const place = trace && at(trace), mark = over(plot, name, look);
       if (place) put(plot, mark, ...place); else mark.hidden = true;
-      if (motions.length) body(plot, name, motions[data.indexOf(trace)]);
     }
   };
   const slider = document.getElementById("time"), now = document.getElementById("now");
