@@ -174,6 +174,7 @@ def _enlarged(findings: Findings, view: View) -> list[Panel]:
     x, y = (near + factor * (path - near)).T
     width = WIDTHS.get(role, 1.5)
     curves = [curve(x, y, role, name_of(role, run), width)]
-    curves.append(curve(*desired.T, "desired", "desired", WIDTHS["desired"]))
+    x, y = desired.T
+    curves.append(curve(x, y, "desired", "desired", WIDTHS["desired"]))
     title = f"Deviations {factor:g} times enlarged"
     return [panel(title, *view.names, curves, equal=True, kind="path")]
