@@ -38,7 +38,6 @@ from grounded_trials.workspace.exciting import Excited
 from grounded_trials.workspace.home.library import Shelved
 from grounded_trials.workspace.home.taking_home import TakenHome
 from grounded_trials.workspace.off_target import OffTarget
-from grounded_trials.workspace.placing import FromStarts
 from grounded_trials.workspace.verifying import Verified
 
 By = Mapping[str, float]
@@ -135,7 +134,6 @@ class ProposeJson(TypedDict):
     noise_cost: float | None
     off_target: list[OffTarget]
     sample_age_s: float | None
-    from_usual_starts: FromStarts | None
 
 
 class IngestedJson(TypedDict):

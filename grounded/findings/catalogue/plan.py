@@ -47,8 +47,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "predicted": Entry(
         "note",
-        "utility {utility}[[, about {log} in its log]][[, {noise} of it by sensor noise]][[; "
-        "{usual} from where the last {runs} runs began]]",
+        "utility {utility}[[, about {log} in its log]][[, {noise} of it by sensor noise]]",
     ),
     "so_far": Entry(
         "note",
@@ -67,8 +66,7 @@ ENTRIES: dict[str, Entry] = {
         "unknown: no run has tested the model[[changed?  since it was changed]][[; by the last "
         "diagnosis it misses {what} by {miss:size} in {ahead}]][[; it can be checked against "
         "{logs:log} of data (`grounded diagnose`)]]",
-        "[[exact? the prediction starts exactly at [task] start: what placing the robot less "
-        "exactly costs shows after a few runs]]",
+        "[[exact? the prediction starts exactly at [task] start]]",
     ),
     "samples": Entry(
         "note",

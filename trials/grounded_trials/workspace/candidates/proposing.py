@@ -37,7 +37,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import Since, left_out
 from grounded_trials.workspace.next_step import Situation, outlook
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
-from grounded_trials.workspace.placing import FromStarts, from_starts
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -59,7 +58,6 @@ class Proposed(Result):
     findings: tuple[Finding, ...] = ()  # what to know before the run, the heaviest first
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
-    from_starts: FromStarts | None = None  # from where runs began so far; None: too few are known
     again: bool = False  # whether the candidate was run before
     made: Finding | None = None  # how the candidate was made
     predicted: Finding | None = None
@@ -91,13 +89,11 @@ class Proposed(Result):
         told = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         errors = [one.to_json() for one in self.off_target]
         age = self.candidate.sample_age if self.candidate else None
-        begun = self.from_starts and self.from_starts.to_json()
         every = [*self.standing.findings, *self.findings]
         every += [one for one in (self.made, self.predicted, self.so_far, self.trust) if one]
         told |= {"notes": list(self.notes)}
         told |= {"findings": [one.to_json() for one in every]}
-        told |= {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
-        return told | {"from_usual_starts": begun}
+        return told | {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -233,7 +229,6 @@ def _told(
     ahead = tuple(replace(one, end_std=0.0) for one in ahead)  # no log's last sample
     if not made.grounded:  # a run that no sensor measured
         ahead = tuple(replace(one, noise=0.0) for one in ahead)
-    begun = from_starts(workspace, made)
     best, again = now.incumbent, any(t.trials for t in same)
     aged, slow = trust.samples(made, now, task), workspace.planner.plan.model.system.note
     notes = [*notes, *([aged] if aged else []), *([found("plan.model", what=slow)] if slow else [])]
@@ -244,10 +239,9 @@ def _told(
         settle((*proposal.findings, *notes)),
         cost,
         ahead,
-        begun,
         again,
         trust.made_how(made, task, now.history),
-        trust.predicted(made, cost, whole, begun),
+        trust.predicted(made, cost, whole),
         None if best is None else trust.so_far(made, best),
         trust.trust(workspace, made, now, whole - cost, status.diagnosis, status.since),
         trust.extent_of(made, task),

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
     from grounded.search.standing import Standing
     from grounded_trials.workspace.folder import Folder
     from grounded_trials.workspace.last_diagnosis import Since
-    from grounded_trials.workspace.placing import FromStarts
 
 LAST = 3  # recent predictions whose errors are told
 NOISE_SHARE = 0.2  # share of a cost above which its part due to sensor noise is told
-PLACED = 0.02  # share of a predicted utility: where runs began is told if it changes more
 STATES = 3  # target states whose range is told; final values of models with 8 states at most
 ENDS = 8
 
@@ -141,26 +139,22 @@ def much_noise(noise: float, utility: float) -> float | None:
     return min(noise, -utility) if noise > NOISE_SHARE * -utility else None
 
 
-def predicted(made: Candidate, cost: float, whole: float, begun: FromStarts | None) -> Finding:
+def predicted(made: Candidate, cost: float, whole: float) -> Finding:
     """Return the predicted utility, and what is to be expected of its log.
 
     Args:
         made: the candidate.
         cost: of the sensor noise in its log that its prediction lacks.
         whole: of all of the sensor noise in its log.
-        begun: what is predicted from where runs began so far.
     """
     promised = made.predicted_utility
     in_log = promised - cost
-    moved = begun is not None and max(abs(begun.utility_change), begun.std) > PLACED * abs(in_log)
     return found(
         "plan.predicted",
         made.id,
         utility=promised,
         log=in_log if cost > 0 and f"{in_log:.4g}" != f"{promised:.4g}" else None,
         noise=much_noise(whole, in_log),
-        usual=Quantity(in_log + begun.utility_change, "1", begun.std) if begun and moved else None,
-        runs=begun.runs if begun and moved else None,
     )
 
 

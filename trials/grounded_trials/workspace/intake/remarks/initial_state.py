@@ -22,12 +22,14 @@ from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.candidates.search_state import standing_of
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.placing import FEWEST, placing
 
 START_IS_OFF = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
 # share of the run's cost by which the start changes it: told, and too much to count; and that
 # while too few other runs tell how the robot is placed
 TOLD, SPOILT, UNKNOWN = 0.05, 0.2, 0.5
+FEWEST = 2  # runs from which it is told how exactly the robot is placed
+MEDIAN_TO_STD = 1.4826  # of the size of a normal variable
+LATEST = 50  # runs that are looked at; the way of placing a robot may change
 
 
 def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
@@ -61,9 +63,9 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     told = sorted((i for i in each if each[i] > least), key=lambda i: -each[i])
     if not told:
         return None
-    placed, whole = placing(workspace, but=trial.id), _changes(workspace, trial, off)
-    unknown = max(placed.runs) < FEWEST
-    usual = np.abs(off) <= START_IS_OFF * np.nan_to_num(placed.rms)
+    (rms, runs), whole = placing(workspace, but=trial.id), _changes(workspace, trial, off)
+    unknown = runs < FEWEST
+    usual = np.abs(off) <= START_IS_OFF * rms
     most = (UNKNOWN if unknown else SPOILT) * cost
     facts = {
         "ran": trial.candidate,
@@ -80,9 +82,32 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     repeats = _to_repeat(workspace, trial)
     if usual[told[0]] and not repeats:
         unit = list(task.model.states.values())[told[0]]
-        rms = Quantity(float(placed.rms[told[0]]), unit)
-        facts |= {"runs": int(placed.runs[told[0]]), "rms": rms}
+        facts |= {"runs": runs, "rms": Quantity(float(rms[told[0]]), unit)}
     return found("run.start", *names, again=repeats, unknown=unknown, **facts)
+
+
+def placing(workspace: Folder, but: str = "") -> tuple[Array, int]:
+    """Return how far the latest runs of a task began off its start (rms, n), and how many they are.
+
+    A run that was discarded counts too, since the robot was placed before it. The rms is estimated
+    by the median, so that a misread log is no usual start; it is 0 of fewer than `FEWEST` runs.
+
+    Args:
+        workspace: the workspace with the runs.
+        but: id of a run that is left out, since it is judged by the others.
+    """
+    task, stored = workspace.task, (*workspace.trials(), *workspace.aside_trials())
+    own = {made.id for made in workspace.read().candidates}
+    runs = (
+        one.trial
+        for one in sorted(stored, key=lambda one: one.stored.number)
+        if one.trial.candidate in own and one.stored.id != but
+    )
+    off = [task.model.difference(run.began, task.start) for run in runs if workspace.fits(run)]
+    known = np.array([one for one in off if np.isfinite(one).all()][-LATEST:])
+    if len(known) < FEWEST:
+        return np.zeros(task.model.n), len(known)
+    return np.asarray(MEDIAN_TO_STD * np.median(np.abs(known), axis=0)), len(known)
 
 
 def _placed(task: Task, trial: Trial, i: int, off: float) -> dict[str, Any]:
