@@ -1,18 +1,9 @@
 """Which number of an MJCF file holds which value of the model: a parameter, or an adopted effect.
 
 An effect that acts where an input enters is a torque of the joint that the input drives: a unit of
-the input is `gain gear` N m there, and T = c sign(w) + b w is frictionloss and damping. One that
-acts on the rate of a joint with a constant inertia M of its own is M times as much.
-
-    parameter             the number of that name
-    joint_friction        frictionloss + c push, damping + b push
-    coulomb_friction:w    frictionloss + c M        viscous_friction:w    damping + k M
-    added_inertia         armature + J push         rate_gain:w           armature - g M / (1 + g)
-    joint_spring          stiffness + k push, springref - b / k
-    input_gain            gear (1 + g), or the gain where a force is limited or fed back
-    delay, latency        delay of the actuator     first_order_lag       filterexact with tau
-
-Everything else is told with its equation.
+the input is `push` = gain gear [N m] there, and T = c sign(w) + b w is frictionloss and damping.
+One that acts on the rate of a joint with a constant inertia M of its own is M times as much.
+`RULES` lists them. Everything else is told with its equation.
 """
 
 from __future__ import annotations
@@ -122,8 +113,21 @@ class Held:
     def adopt(self, effect: str, values: Mapping[str, Estimate]) -> bool:
         """Add an effect's values; return whether the format can hold it."""
         family, _, target = effect.partition(":")
-        rule, c = _RULES.get(family), {q: one.value for q, one in values.items()}
-        return rule is not None and rule(self, target, c, {q: e.std for q, e in values.items()})
+        found = list[tuple[str, int, str, float, Estimate]]()
+        for q, field, factors in RULES.get(family, ()):
+            places = factors(self, target)
+            if not places:
+                return False
+            if (one := values.get(q)) and one.value:
+                found += [(*place[:2], place[2] or field, place[3], one) for place in places]
+        for kind, index, field, factor, one in found:
+            if field == "armature":  # frictions on rates are of the inertia with it
+                dof, by = self.file.jnt_dofadr[index], factor * one.value
+                if self.now.dof_armature[dof] + by < 0:
+                    return False
+                self.now.dof_armature[dof] += by
+            self.add(kind, index, field, factor * one.value, abs(factor) * one.std)
+        return bool(found)
 
     @property
     def numbers(self) -> tuple[Number, ...]:
@@ -206,125 +210,69 @@ def _tau(model: Any, i: int) -> float:
 
 # fields that no parameter of the adapter names: how to read them, and their units
 MORE: dict[str, tuple[Callable[[Any, int], float], str]] = {
-    "springref": (lambda m, i: float(m.qpos_spring[m.jnt_qposadr[i]]), "rad"),
     "delay": (lambda m, i: float(getattr(m, "actuator_delay", np.zeros(m.nu))[i]), "s"),
     "lag": (_tau, "s"),
 }
-
-Values = Mapping[str, float]
 
 
 def _object(mj: Any, kind: str) -> int:
     return int(getattr(mj.mjtObj, f"mjOBJ_{kind.upper()}"))
 
 
-def _friction(held: Held, target: str, c: Values, std: Values) -> bool:
+# an element and its index, another field than the rule's or "", and the factor of its number
+Place = tuple[str, int, str, float]
+
+
+def _driven(held: Held, target: str) -> list[Place]:
+    """Return the joint whose velocity an input drives, and the torque by a unit of that input."""
     tau, _, w = target.partition("<-")
-    dof, push = held.dof(w), held.push(tau)
-    return _on_joint(held, dof, push, {"frictionloss": "c", "damping": "b"}, c, std)
+    return _joint(held, held.dof(w), held.push(tau))
 
 
-def _on_joint(
-    held: Held, dof: int, factor: float, fields: Mapping[str, str], c: Values, std: Values
-) -> bool:
-    """Add quantities of an effect, times a factor, to fields of the joint of a dof."""
-    if dof < 0 or not factor:
-        return False
-    joint = int(held.file.dof_jntid[dof])
-    for field, name in fields.items():
-        if c.get(name):
-            spread = abs(factor) * std.get(name, math.nan)
-            held.add("joint", joint, field, factor * c[name], spread)
-    return True
-
-
-def _on_rate(field: str, name: str) -> Callable[[Held, str, Values, Values], bool]:
-    """Return the rule of a friction that acts on the rate of a joint."""
-
-    def rule(held: Held, target: str, c: Values, std: Values) -> bool:
-        dof = held.dof(target)
-        return dof >= 0 and _on_joint(held, dof, held.inertia(dof), {field: name}, c, std)
-
-    return rule
-
-
-def _armature(held: Held, target: str, c: Values, std: Values) -> bool:
-    tau, _, w = target.partition("<-")
-    push = held.push(tau)
-    return _inertia(held, held.dof(w), push * c["J"], push * std.get("J", math.nan))
-
-
-def _rate_gain(held: Held, target: str, c: Values, std: Values) -> bool:
+def _of_rate(held: Held, target: str) -> list[Place]:
+    """Return the joint of a rate, and its inertia."""
     dof = held.dof(target)
-    M = held.inertia(dof) if dof >= 0 else 0.0
-    slope = -M / (1 + c["g"]) ** 2
-    return _inertia(held, dof, -c["g"] * M / (1 + c["g"]), slope * std.get("g", math.nan))
+    return _joint(held, dof, held.inertia(dof) if dof >= 0 else 0.0)
 
 
-def _inertia(held: Held, dof: int, by: float, std: float) -> bool:
-    """Add to a joint's armature, which can't be negative."""
-    if dof < 0 or not by or held.now.dof_armature[dof] + by < 0:
-        return False
-    held.add("joint", int(held.file.dof_jntid[dof]), "armature", by, abs(std))
-    held.now.dof_armature[dof] += by  # frictions of its rate are of the inertia now
-    return True
+def _joint(held: Held, dof: int, factor: float) -> list[Place]:
+    return [("joint", int(held.file.dof_jntid[dof]), "", factor)] if dof >= 0 and factor else []
 
 
-def _spring(held: Held, target: str, c: Values, std: Values) -> bool:
-    tau, _, q = target.partition("<-")
-    dof, push = held.dof(q), held.push(tau)
-    if dof < 0 or not push * c["k"] > 0:
-        return False
-    joint = int(held.file.dof_jntid[dof])
-    if held.now.jnt_stiffness[joint]:
-        return False
-    held.add("joint", joint, "stiffness", push * c["k"], abs(push) * std.get("k", math.nan))
-    rest = value_of(held.file, "joint", joint, "springref")
-    held.add("joint", joint, "springref", -c["b"] / c["k"] - rest, std.get("b", math.nan) / c["k"])
-    return True
-
-
-def _each(held: Held, target: str) -> list[int]:
+def _actuators(held: Held, target: str) -> list[Place]:
     """Return the actuators of inputs joined by "+"; none if one of them is not an actuator."""
     found = [held.actuator(name) for name in target.split("+")]
-    return found if min(found) >= 0 else []
+    return [("actuator", i, "", 1.0) for i in found] if min(found) >= 0 else []
 
 
-def _gain(held: Held, target: str, c: Values, std: Values) -> bool:
-    each = _each(held, target)
-    for i in each:
-        now = held.now
-        plain = not (now.actuator_biastype[i] or now.actuator_forcelimited[i])
-        field = "gear" if plain else "gain"
-        was = float(now.actuator_gear[i, 0] if plain else now.actuator_gainprm[i, 0])
-        held.add("actuator", i, field, was * c["g"], abs(was) * std.get("g", math.nan))
-    return bool(each)
+def _delayed(held: Held, target: str) -> list[Place]:
+    return _actuators(held, target) if hasattr(held.file, "actuator_delay") else []
 
 
-def _delay(held: Held, target: str, c: Values, std: Values) -> bool:
-    each = _each(held, target) if hasattr(held.file, "actuator_delay") else []
-    for i in each:
-        held.add("actuator", i, "delay", c["d"], std.get("d", math.nan))
-    return bool(each)
+def _lagged(held: Held, target: str) -> list[Place]:
+    """Return the actuators, unless one has a lag: there is no second one in a row."""
+    each = _actuators(held, target)
+    return [] if any(held.file.actuator_dyntype[i] for _, i, *_ in each) else each
 
 
-def _lag(held: Held, target: str, c: Values, std: Values) -> bool:
-    each = _each(held, target)
-    if any(held.file.actuator_dyntype[i] for i in each):
-        return False  # two lags in a row
-    for i in each:
-        held.add("actuator", i, "lag", c["tau"], std.get("tau", math.nan))
-    return bool(each)
+def _amplified(held: Held, target: str) -> list[Place]:
+    """Return the actuators with their gears, or gains where a force is limited or fed back."""
+    now, found = held.now, list[Place]()
+    for kind, i, *_ in _actuators(held, target):
+        gear = not (now.actuator_biastype[i] or now.actuator_forcelimited[i])
+        was = now.actuator_gear[i, 0] if gear else now.actuator_gainprm[i, 0]
+        found.append((kind, i, "" if gear else "gain", float(was)))
+    return found
 
 
-_RULES: dict[str, Callable[[Held, str, Values, Values], bool]] = {
-    "joint_friction": _friction,
-    "coulomb_friction": _on_rate("frictionloss", "c"),
-    "viscous_friction": _on_rate("damping", "k"),
-    "added_inertia": _armature,
-    "rate_gain": _rate_gain,
-    "joint_spring": _spring,
-    "input_gain": _gain,
-    "delay": _delay,
-    "first_order_lag": _lag,
+Rule = tuple[str, str, Callable[[Held, str], list[Place]]]
+# of a family, each quantity with the field that holds it, and where that is
+RULES: dict[str, tuple[Rule, ...]] = {
+    "joint_friction": (("c", "frictionloss", _driven), ("b", "damping", _driven)),
+    "coulomb_friction": (("c", "frictionloss", _of_rate),),
+    "viscous_friction": (("k", "damping", _of_rate),),
+    "added_inertia": (("J", "armature", _driven),),
+    "input_gain": (("g", "gear", _amplified),),
+    "delay": (("d", "delay", _delayed),),
+    "first_order_lag": (("tau", "lag", _lagged),),
 }

@@ -135,10 +135,7 @@ class Mjcf:
             return self._mass(element, number)
         if number.kind == "actuator":
             return self._actuator(element, number)
-        value = number.value
-        if number.field == "springref" and self._degrees():
-            value = math.degrees(value)
-        self._first(element, number.field, value, number.index)
+        self._first(element, number.field, number.value, number.index)
         return True
 
     def _first(self, element: Element, name: str, value: float, index: int) -> None:
@@ -147,10 +144,6 @@ class Mjcf:
         if not element.get(name) and name in VECTORS:
             rest = [f"{one:.12g}" for one in getattr(self.compiled, VECTORS[name])[index, 1:]]
         element.set(name, " ".join([f"{value:.8g}", *rest]))
-
-    def _degrees(self) -> bool:
-        stated = [one.get("angle") for one in self.main.root.iter("compiler")]
-        return "radian" not in stated
 
     def _mass(self, element: Element, number: Number) -> bool:
         """Scale the mass and the inertia of a body."""
