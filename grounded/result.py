@@ -13,7 +13,7 @@ from dataclasses import MISSING, dataclass, fields
 from functools import cache
 from math import isfinite
 from types import UnionType
-from typing import TYPE_CHECKING, Any, Self, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_origin, get_type_hints
 
 from grounded.errors import GroundedError
 
@@ -158,6 +158,7 @@ def _told(value: float, scale: float, unit: str, least: float = PREFIX_BELOW) ->
 
 
 UNSAID: Mapping[str, Any] = {"key": ""}  # metadata of a field that is not written to JSON
+NULL: Mapping[str, Any] = {"null": True}  # of a field whose empty value is null in JSON
 
 
 class Result:
@@ -205,10 +206,12 @@ def document(**values: Any) -> dict[str, Any]:
 class Document(Result):
     """Base class of frozen dataclasses that are written to JSON field by field and read back.
 
-    A field's metadata may set the JSON `key` ("": the field is not written), or `brief`, which
-    omits the key if the value is None, not finite or "". Two documents are equal if their JSON is
-    equal; numbers that are not finite are null there.
+    A field's metadata may set the JSON `key` ("": the field is not written), `brief`, which omits
+    the key if the value is None, not finite or "", or `null`. The properties in `ALSO` are written,
+    too. Two documents are equal if their JSON is equal; numbers that are not finite are null there.
     """
+
+    ALSO: ClassVar[tuple[str, ...]] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields by JSON key."""
@@ -218,8 +221,8 @@ class Document(Result):
             nothing = value in (None, "") or (isinstance(value, float) and not isfinite(value))
             key = one.metadata.get("key", one.name)
             if key and not (one.metadata.get("brief") and nothing):
-                found[key] = plain(value)
-        return found
+                found[key] = plain(value or None if one.metadata.get("null") else value)
+        return found | {name: plain(getattr(self, name)) for name in self.ALSO}
 
     @classmethod
     def from_json(cls, document: Any) -> Self:

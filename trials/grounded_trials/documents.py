@@ -29,14 +29,20 @@ from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
 from grounded.findings.catalogue import Entry
 from grounded_trials.logs.recover import Recovery
+from grounded_trials.logs.signal_report import SignalReport
+from grounded_trials.starting.begin import Begun
+from grounded_trials.starting.drawing import Drawn
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Adopted, Undone
 from grounded_trials.workspace.candidates.exporting import Exported
+from grounded_trials.workspace.candidates.proposing import Proposed
 from grounded_trials.workspace.candidates.running import Ran
 from grounded_trials.workspace.discarding import SetAside
 from grounded_trials.workspace.exciting import Excited
 from grounded_trials.workspace.home.library import Shelved
 from grounded_trials.workspace.home.taking_home import TakenHome
+from grounded_trials.workspace.intake.ingest import Ingested
+from grounded_trials.workspace.looping import NextRun
 from grounded_trials.workspace.off_target import OffTarget
 from grounded_trials.workspace.verifying import Verified
 
@@ -136,30 +142,10 @@ class ProposeJson(TypedDict):
     sample_age_s: float | None
 
 
-class IngestedJson(TypedDict):
-    """A log of `ingest`."""
-
-    trial: str
-    sha256: str
-    known: bool
-    candidate: str | None
-    utility: float | None
-    failed: bool
-    accepted: bool | None
-    verdict: str | None
-    crashed: list[str]
-    off_target: list[OffTarget]
-    findings: list[Finding]
-    warnings: list[str]
-    faults: list[str]
-    notes: list[str]
-    signals: list[dict[str, Any]]
-
-
 class IngestJson(TypedDict):
     """`ingest`."""
 
-    trials: list[IngestedJson]
+    trials: list[Ingested]
 
 
 class ErrorsJson(TypedDict):
@@ -247,32 +233,6 @@ class InspectJson(TypedDict):
     log_table: str
 
 
-class SignalJson(TypedDict):
-    """A state or input that was sought in a log."""
-
-    name: str
-    path: str | None
-    sure: bool
-    reasons: list[str]
-    rivals: list[str]
-    scale: float
-
-
-class BegunJson(TypedDict):
-    """`init --from`."""
-
-    workspace: str
-    log: str
-    kind: str | None
-    why: str
-    dt: float
-    horizon: int
-    signals: list[SignalJson]
-    target: str
-    notes: list[str]
-    findings: list[Finding]
-
-
 class CreatedJson(TypedDict):
     """`init --example`, `init --blank`."""
 
@@ -286,26 +246,6 @@ class ExamplesJson(TypedDict):
     """`init --list`."""
 
     examples: dict[str, str]
-
-
-class TargetJson(TypedDict):
-    """`target`."""
-
-    target: str
-    horizon: int
-    columns: dict[str, list[float]]
-    free: list[str]
-    findings: list[Finding]
-
-
-class NextJson(TypedDict):
-    """`next`."""
-
-    trials: list[IngestedJson]
-    propose: ProposeJson | None
-    export: Exported | None
-    removed: list[str]
-    findings: list[Finding]
 
 
 class FamilyJson(TypedDict):
@@ -341,25 +281,30 @@ DOCUMENTS: dict[str, Any] = {
     "export": Exported | TakenHome | Shelved,
     "fit": FitJson,
     "ingest": IngestJson,
-    "init": BegunJson | CreatedJson | ExamplesJson,
+    "init": Begun | CreatedJson | ExamplesJson,
     "inspect": InspectJson,
     "learn": StatusJson,
-    "next": NextJson,
+    "next": NextRun,
     "propose": ProposeJson,
     "recover": Recovery,
     "report": ReportJson,
     "restore": SetAside,
     "run": Ran,
     "status": StatusJson,
-    "target": TargetJson,
+    "target": Drawn,
     "verify": Verified,
 }
-_AS = {Finding: FindingJson, Quantity: QuantityJson}  # types that are written in another form
+_AS = {
+    Finding: FindingJson,
+    Quantity: QuantityJson,
+    Proposed: ProposeJson,
+}  # types that are written in another form
 _MORE: dict[str, dict[str, Any]] = {  # what a document has beside its fields
     "Diagnosis": {"next_trial": str, "unknowable": list[str]},
     "Verdict": {"sentence": str},
     "Finding": {"finding": str},
 }
+_LATE = {"SignalReport": SignalReport}  # what a module imports for its types alone
 _PLAIN = {str: "string", Path: "string", bool: "boolean", int: "integer", NoneType: "null"}
 
 
@@ -401,7 +346,7 @@ def _of(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
 
 
 def _object(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
-    hints, needed = get_type_hints(kind, include_extras=True), list[str]()
+    hints, needed = get_type_hints(kind, localns=_LATE, include_extras=True), list[str]()
     if is_typeddict(kind):
         needed = [name for name, hint in hints.items() if get_origin(hint) is not NotRequired]
         found = {name: _of(_bare(hint), known) for name, hint in hints.items()}
@@ -412,6 +357,11 @@ def _object(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
             if key := one.metadata.get("key", one.name):
                 found[key] = _of(hints[one.name], known)
                 needed += [] if one.metadata.get("brief") else [key]
+                if one.metadata.get("null"):
+                    found[key] = {"anyOf": [found[key], {"type": "null"}]}
+        for key in getattr(kind, "ALSO", ()):
+            found[key] = _of(get_type_hints(getattr(kind, key).fget)["return"], known)
+            needed.append(key)
         for key, more in _MORE.get(str(getattr(kind, "__name__", "")), {}).items():
             found[key] = _of(more, known)
             needed.append(key)

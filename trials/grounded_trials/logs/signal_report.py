@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Quantity, Weight, found
+from grounded.result import Document
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.samples import MIXED_S, Samples
 from grounded_trials.logs.signals import Series
@@ -28,8 +29,8 @@ LOST = 0.1  # least share of a log that is told if one state lacks it
 DISORDERED = 0.01  # least share of stamps out of order that is told; sorting loses nothing of them
 
 
-@dataclass(frozen=True)
-class SignalReport:
+@dataclass(frozen=True, eq=False)
+class SignalReport(Document):
     """Statistics of one signal; durations in seconds, positions in seconds after the start."""
 
     name: str

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import heading, rate_states
-from grounded.result import Result
+from grounded.result import NULL, UNSAID, Document
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.assignment import assigned
@@ -58,22 +58,37 @@ HORIZON = 200  # largest number of steps of a target taken from a recorded run
 Ask = Callable[[Guess], str]
 
 
+class SignalJson(TypedDict):
+    """A state or input that was sought in a log."""
+
+    name: str
+    path: str | None
+    sure: bool
+    reasons: list[str]
+    rivals: list[str]
+    scale: float
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Begun(Result):
+class Begun(Document):
     """The result of making a workspace from a log."""
+
+    ALSO = ("signals", "notes")
 
     workspace: str
     log: str
-    kind: str  # of the model skeleton; "" for the user's own model
+    kind: str = field(metadata=NULL)  # of the model skeleton; "" for the user's own model
     why: str  # why this kind was chosen
     dt: float  # [s]
     horizon: int
-    states: tuple[Guess, ...]
-    inputs: tuple[Guess, ...]
+    states: tuple[Guess, ...] = field(metadata=UNSAID)
+    inputs: tuple[Guess, ...] = field(metadata=UNSAID)
     target: str  # description of target.csv
-    start: str = ""  # description of [task] start
+    start: str = field(metadata=UNSAID, default="")  # description of [task] start
     findings: tuple[Finding, ...] = ()
-    again: tuple[str, ...] = ()  # arguments of `init` once the log's time column is renamed
+    again: tuple[str, ...] = field(
+        metadata=UNSAID, default=()
+    )  # arguments of `init` once the log's time column is renamed
 
     @property
     def unsure(self) -> tuple[Guess, ...]:
@@ -101,9 +116,15 @@ class Begun(Result):
         both = (*self.states, *self.inputs)
         return f"{self.workspace}: {sum(bool(g.path) for g in both)} of {len(both)} signals found"
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `init --from --json`."""
-        signals = [
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The findings in words."""
+        return tuple(one.sentence for one in self.findings)
+
+    @property
+    def signals(self) -> list[SignalJson]:
+        """What was found of each state and input."""
+        return [
             {
                 "name": guess.name,
                 "path": guess.path or None,
@@ -114,18 +135,6 @@ class Begun(Result):
             }
             for guess in (*self.states, *self.inputs)
         ]
-        return {
-            "workspace": self.workspace,
-            "log": self.log,
-            "kind": self.kind or None,
-            "why": self.why,
-            "dt": self.dt,
-            "horizon": self.horizon,
-            "signals": signals,
-            "target": self.target,
-            "notes": [one.sentence for one in self.findings],
-            "findings": [one.to_json() for one in self.findings],
-        }
 
 
 def begin(

@@ -17,6 +17,7 @@ from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import velocities
+from grounded.result import UNSAID, Document
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
@@ -137,13 +138,14 @@ class Manoeuvre:
         return self.shape in PATHS
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+@dataclass(frozen=True, eq=False, repr=False)
+class Drawn(Document):
     """What was drawn.
 
     Args:
         path: the file of the target.
-        columns: of the tracked states, (H + 1,) each.
+        ranges: lowest and highest value of the column of each tracked state.
+        horizon: number of control steps H.
         units: of the model's states.
         dt: control interval [s].
         free: states without a column.
@@ -153,35 +155,16 @@ class Drawn:
         then: the command to type next.
     """
 
-    path: Path
-    columns: Mapping[str, Array]
-    units: Mapping[str, str]
-    dt: float
+    path: Path = field(metadata={"key": "target"})
+    ranges: Mapping[str, tuple[float, float]] = field(metadata={"key": "columns"})
+    horizon: int
+    units: Mapping[str, str] = field(metadata=UNSAID)
+    dt: float = field(metadata=UNSAID)
     free: tuple[str, ...]
-    driven: tuple[float, float]
-    weights: Weights
+    driven: tuple[float, float] = field(metadata=UNSAID)
+    weights: Weights = field(metadata=UNSAID)
     findings: tuple[Finding, ...]
-    then: NextCommand
-
-    @property
-    def ranges(self) -> dict[str, tuple[float, float]]:
-        """Lowest and highest value of each column."""
-        return {name: (float(v.min()), float(v.max())) for name, v in self.columns.items()}
-
-    @property
-    def horizon(self) -> int:
-        """Number of control steps H."""
-        return len(next(iter(self.columns.values()))) - 1
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document that `target --json` prints."""
-        return {
-            "target": str(self.path),
-            "horizon": self.horizon,
-            "columns": self.ranges,
-            "free": list(self.free),
-            "findings": [one.to_json() for one in self.findings],
-        }
+    then: NextCommand = field(metadata=UNSAID)
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,7 +224,8 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     case = _Case(workspace, asked, columns, free, rest, seen, reward)
     return Drawn(
         path,
-        columns,
+        {name: (float(v.min()), float(v.max())) for name, v in columns.items()},
+        len(next(iter(columns.values()))) - 1,
         model.states,
         old.dt,
         free,

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from grounded.checks import whole_number
 from grounded.errors import GroundedError, NextCommand
+from grounded.findings import Finding
 from grounded.findings import found as said
-from grounded.result import Result
+from grounded.result import UNSAID, Document
 from grounded.search.candidate import Candidate
 from grounded.search.standing import Phase
 from grounded_trials.plain_file import path_of
@@ -31,12 +31,16 @@ MOST_TRIALS = 100_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class NextRun(Result):
+class NextRun(Document):
     """The result of `next`: the ingested log, what to run next, and the file for the robot."""
 
-    taken: Ingested
-    proposed: Proposed | None  # None if the log should be discarded first
-    exported: Exported | None  # None if the search has ended
+    ALSO = ("trials", "findings")
+
+    taken: Ingested = field(metadata=UNSAID)
+    # None if the log should be discarded first
+    proposed: Proposed | None = field(metadata={"key": "propose"})
+    # None if the search has ended
+    exported: Exported | None = field(metadata={"key": "export"})
     removed: tuple[Path, ...] = ()  # deleted exports of candidates that are void now
 
     def summary(self) -> str:
@@ -46,15 +50,15 @@ class NextRun(Result):
         name = None if self.proposed.candidate is None else self.proposed.candidate.id
         return f"{self.taken.trial} is stored; next: {name or 'nothing, the search has ended'}"
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `next --json`: those of ingest, propose and export."""
-        return {
-            "trials": [self.taken.to_json()],
-            "propose": None if self.proposed is None else self.proposed.to_json(),
-            "export": None if self.exported is None else self.exported.to_json(),
-            "removed": [str(path) for path in self.removed],
-            "findings": [one.to_json() for one in self.taken.findings],
-        }
+    @property
+    def trials(self) -> tuple[Ingested, ...]:
+        """The ingested log, as in the document of `ingest`."""
+        return (self.taken,)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is told of the log."""
+        return self.taken.findings
 
 
 def learn_in(

@@ -11,10 +11,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from grounded.accounts.sent import as_sent
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
-from grounded.result import Result
+from grounded.result import NULL, UNSAID, Document
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.standing import Phase, Standing
 from grounded.task import Task
@@ -67,23 +67,32 @@ ASIDE = "set aside"  # the verdict on a run that does not count
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Ingested(Result):
-    """One ingested log."""
+class Ingested(Document):
+    """One ingested log; a failed run has no utility in JSON."""
+
+    ALSO = ("failed", "faults", "warnings", "notes")
 
     trial: str  # its short name, t0007
     sha256: str
     known: bool  # it had been stored before
-    candidate: str  # "" for data
+    candidate: str = field(metadata=NULL)  # "" for data
     utility: float | None  # None for data; -inf for a run that failed
     accepted: bool | None  # None for data, or if not decided yet
     findings: tuple[Finding, ...]  # on the log and the run, the heaviest first
     signals: tuple[SignalReport, ...]  # for a foreign log
-    verdict: str = ""  # a word of `wording.verdict`, run again, probe; "" for data
+    # a word of `wording.verdict`, run again, probe; "" for data
+    verdict: str = field(metadata=NULL, default="")
     crashed: tuple[str, ...] = ()  # the candidate's trials that ended early, if it crashed
-    mean: float = math.nan  # utility of the candidate's runs, by which it is judged
-    runs: int = 0  # how many these are
+    # utility of the candidate's runs, by which it is judged, and how many these are
+    mean: float = field(metadata=UNSAID, default=math.nan)
+    runs: int = field(metadata=UNSAID, default=0)
     off_target: tuple[OffTarget, ...] = ()  # errors of the run, in units
-    then: NextCommand = PROPOSE
+    then: NextCommand = field(metadata=UNSAID, default=PROPOSE)
+
+    @property
+    def failed(self) -> bool:
+        """Whether the run ended early."""
+        return self.utility == -math.inf
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -103,26 +112,6 @@ class Ingested(Result):
     def summary(self) -> str:
         """Return the trial, what it ran and the verdict."""
         return f"{self.trial}: {f'{self.candidate}, {self.verdict}' if self.candidate else 'data'}"
-
-    def to_json(self) -> dict[str, Any]:
-        """Return its entry in `ingest --json`; for a failed run utility is null, `failed` true."""
-        return {
-            "trial": self.trial,
-            "sha256": self.sha256,
-            "known": self.known,
-            "candidate": self.candidate or None,
-            "utility": self.utility,
-            "failed": self.utility == float("-inf"),
-            "accepted": self.accepted,
-            "verdict": self.verdict or None,
-            "crashed": list(self.crashed),
-            "off_target": [one.to_json() for one in self.off_target],
-            "findings": [one.to_json() for one in self.findings],
-            "warnings": list(self.warnings),
-            "faults": list(self.faults),
-            "notes": list(self.notes),
-            "signals": [vars(signal) for signal in self.signals],
-        }
 
 
 def ingest_log(
