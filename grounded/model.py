@@ -150,11 +150,6 @@ def is_clock(state: str) -> bool:
     return state.endswith("_clock")
 
 
-def all_at_bounds(params: Mapping[str, Param], values: Mapping[str, float]) -> bool:
-    """Return whether there are values and each lies on a bound of its parameter."""
-    return bool(values) and all(params[n].at_bound(v) for n, v in values.items())
-
-
 @dataclass(frozen=True, eq=False)
 class Model:
     """A dynamics model: named states and inputs with units, parameters and their equations.

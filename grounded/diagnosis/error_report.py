@@ -257,14 +257,12 @@ class Credit(Document):
     """Credit of an effect, or of "calibration": the loss of prediction accuracy without it.
 
     share: of the total gain in log error, over channels and horizons; without_it: rms error by
-    channel, 1 s ahead, with all the rest fitted again; times: how many times as large errors are
-    without it, the geometric mean over channels and horizons.
+    channel, 1 s ahead, with all the rest fitted again.
     """
 
     of: str
     share: float = math.nan
     without_it: Mapping[str, float] = field(default_factory=dict)
-    times: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)

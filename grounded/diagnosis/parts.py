@@ -22,7 +22,6 @@ from grounded.diagnosis.error_report import (
     Credit,
     Gap,
     Identifiable,
-    Region,
     Remainder,
     RulerRow,
     Where,
@@ -47,17 +46,15 @@ UNKNOWN = 1e4  # times a value, at least of 1: standard deviation from which it 
 class Verdict(Document):
     """The verdict: its kind, and the effects that it claims.
 
-    `causes` has the words of each entry of `Diagnosis.credit`. `parameters` are off. `look_for`:
-    number of effects that a deeper diagnosis may name, or 0. `again`: whether to diagnose again
-    once these effects, as many as can be named, are adopted. `limit`: the code of the finding for
-    which no cause is named.
+    `causes` has the words of each entry of `Diagnosis.credit`. `parameters` are off. `again`:
+    whether as many effects are named as were looked for and more is left, so that one may diagnose
+    again once these are adopted. `limit`: the code of the finding for which no cause is named.
     """
 
     kind: str  # one of `Kind`
     effects: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
-    look_for: int = 0
     again: bool = field(metadata=BRIEF, default=False)
     limit: str = field(metadata=BRIEF, default="")
 
@@ -125,22 +122,12 @@ class Likeness(Document):
 
 @dataclass(frozen=True, eq=False)
 class Unconfirmed(Document):
-    """A likely effect that few trials show, mostly `trial`.
-
-    seen: number of trials that hold most of its action, and of all trials; `trials`: these, those
-    that show it best first. region: where it acts.
-    repeats: these trials all make nearly the same motion, so it can't be distinguished from
-    anything else that repeats with the motion.
-    """
+    """A likely effect that only one group of trials shows: these."""
 
     effect: str
     params: Mapping[str, Estimate] = field(default_factory=dict)
     evidence: float = math.nan  # [nats]
-    trial: str = ""
-    seen: tuple[int, int] = (1, 1)
-    region: Region | None = None
-    repeats: bool = False
-    trials: tuple[str, ...] = field(metadata=BRIEF, default=())
+    trials: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -253,7 +240,7 @@ class Diagnosis(Document):
     acting: tuple[str, ...] = ()  # the claimed effects in the order in which they act
     gap: Gap = field(default_factory=Gap)
     leftover: tuple[Remainder, ...] = ()
-    unconfirmed: tuple[Unconfirmed, ...] = ()  # likely effects that are not claimed
+    unconfirmed: tuple[Unconfirmed, ...] = ()  # likely, but shown by one group of trials
     correction: Correction | None = None  # if there is a leftover
     noise: NoiseLevels = field(default_factory=NoiseLevels)
     parameters: Mapping[str, Estimate] = field(default_factory=dict)  # calibrated beside effects

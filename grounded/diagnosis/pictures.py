@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.telling import columns_told, larger
+from grounded.diagnosis.telling import columns_told
 from grounded.figures.figure import Figure, Panel, bars, curve, legend, panel
 from grounded.result import figure, measured, measured_alike, percent, shown
 
@@ -91,10 +91,8 @@ def credit_figure(diagnosis: Diagnosis, states: int = STATES) -> Figure | None:
     names = sorted(changed, key=lambda name: changed[name])[:states]
     panels = [p for name in names if error and (p := worth_of(name, error, diagnosis))]
     if credit:
-        shares = [
-            (c.of, c.share, larger(c.times) or percent(c.share), "best") for c in credit[:MOST_BARS]
-        ]
-        panels.insert(0, bars("Errors without each", shares))
+        shares = [(c.of, c.share, percent(c.share), "best") for c in credit[:MOST_BARS]]
+        panels.insert(0, bars("Share of the gain", shares))
     return Figure("credit", "What each is worth", "", panels) if panels else None
 
 

@@ -10,20 +10,19 @@ from typing import Any
 from grounded import places
 from grounded.accounts.finding import in_the_log
 from grounded.diagnosis.causes import (
-    acts_reversed,
     effect_of,
     furthest_apart,
     sign_only,
     value_called,
 )
 from grounded.diagnosis.error_report import RulerRow, errors, excess, lost_most, open_noise
-from grounded.diagnosis.levels import ALIKE, HALF, SURE
+from grounded.diagnosis.levels import HALF, SURE
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.parts import Diagnosis, Estimate, Ranked
+from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.diagnosis.validation.claims import Claims
-from grounded.effects import ParamFamily, like_a_load
+from grounded.effects import ParamFamily
 from grounded.findings import Finding, Quantity, Weight, found
-from grounded.model import Model, all_at_bounds
+from grounded.model import Model
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -59,11 +58,8 @@ def remarks(d: Diagnosis, model: Model, adopted: Collection[str] = ()) -> Iterat
             nats=seen.evidence,
             effect=seen.effect,
             values=", ".join(f"{name} = {e.text}" for name, e in seen.params.items()),
-            seen=seen.seen[0],
-            trials=seen.seen[1],
-            repeats=seen.repeats,
-            trial=None if seen.repeats else seen.trial,
-            place=seen.region.told if seen.region else None,
+            seen=len(seen.trials),
+            trials=d.trials,
         )
     if d.effects or d.verdict.parameters:
         yield from _of_errors(d)
@@ -150,13 +146,6 @@ def _of_values(d: Diagnosis, adopted: Collection[str]) -> Iterator[Finding]:
     for row in (row for row in d.ranking if row.claimed and row.effect.startswith("input_gain:")):
         if sign_only(row.effect, row.params):
             yield found("gap.sign", row.effect, input=row.effect.partition(":")[2])
-        elif _power_of_ten(1 + row.params["g"].value):
-            yield found("gap.unit", row.effect, effect=row.effect)
-
-
-def _power_of_ten(ratio: float) -> bool:
-    power = round(math.log10(ratio)) if ratio > 0 else 0
-    return power != 0 and abs(ratio / 10.0**power - 1) <= ALIKE
 
 
 def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
@@ -196,25 +185,14 @@ def next_step(
         return found("gap.next.record")
     if d.changed:
         return found("gap.next.changed")
-    known = claims.parameters()
-    off_bounds = {n: known[n].value for n in d.verdict.parameters}
-    ended = all_at_bounds(model.params, off_bounds)
-    turned = [row for row in d.ranking if row.effect in names and _to_flip(row, ended)]
+    turned = [row.effect for row in d.ranking if row.claimed and sign_only(row.effect, row.params)]
     separable = [group for group in d.indistinguishable if group not in d.equivalent]
     if separable:
         first, *others = separable[0]
         return found("gap.next.apart", effect=first, others=tuple(others))
     if d.unconfirmed and not d.indistinguishable:
-        one = d.unconfirmed[0]
-        place = one.region.told if one.region else None
-        return found(
-            "gap.next.confirm",
-            one.effect,
-            effect=one.effect,
-            place=place,
-            repeats=one.repeats,
-            trial=None if one.repeats else one.trial,
-        )
+        effect = d.unconfirmed[0].effect
+        return found("gap.next.confirm", effect, effect=effect)
     look = _look(d, off, task, trials, simulated(model)) if off else None
     if not names and look is not None:
         return look
@@ -222,24 +200,10 @@ def next_step(
         return found("gap.next.none", adopted=bool(adopted))
     if doubt is not None:
         return doubt
-    if len(names) > 1 and like_a_load(model, names):
-        return found("gap.next.load", *names)
     if turned:
-        return found("gap.next.flip", input=turned[0].effect.partition(":")[2])
-    if ended:
-        return found("gap.next.bounds", *off_bounds)
+        return found("gap.next.flip", input=turned[0].partition(":")[2])
     own = all(isinstance(effect.family, ParamFamily) for effect in effects) and not adopted
     return found("gap.next.adopt", own="yes" if own else "no", left=bool(d.leftover))
-
-
-def _to_flip(row: Ranked, ended: bool) -> bool:
-    """Return whether an input's sign is to be flipped before anything is adopted.
-
-    If parameters ended at their bounds, the strength of a reversed input is not known.
-    """
-    name, params = row.effect, row.params
-    gain = name.startswith("input_gain:")
-    return sign_only(name, params) or (ended and gain and acts_reversed(params))
 
 
 def _look(

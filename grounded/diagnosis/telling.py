@@ -196,21 +196,10 @@ COLUMNS = {
 }
 
 
-def error_table(diagnosis: Diagnosis, *, whole_trials: bool = True) -> tuple[list[Cells], Cells]:
-    """Return (rows, header) of the held-out prediction errors, in the units of the states.
-
-    Args:
-        diagnosis: the result.
-        whole_trials: whether to add the errors over whole trials to those a horizon ahead. They
-            are added in any case if these are told.
-    """
+def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
+    """Return (rows, header) of the held-out prediction errors, in the units of the states."""
     rows_of = diagnosis.prediction_error
-    row = telling(rows_of)
-    ahead = [one for one in [furthest(rows_of)] if one]
-    whole = [one for one in rows_of if one.whole_trial]
-    if not (whole_trials or not ahead or (row is not None and row.whole_trial)):
-        whole = []
-    shown_rows = (*ahead, *whole)
+    shown_rows = [one for one in rows_of if one is furthest(rows_of) or one.whole_trial]
     columns = columns_told(diagnosis)
     rows: list[Cells] = []
     for one in shown_rows:
@@ -243,38 +232,12 @@ def _cell(row: RulerRow, column: str, name: str) -> str:
     return figure(value, 3) if math.isfinite(value) else "-"
 
 
-def larger(times: float) -> str:
-    """Return `+7 %`, or `2.4 times` from a factor of 2 on; "" for NaN."""
-    if math.isnan(times):  # a document of an older version
-        return ""
-    if times < 2:
-        return f"+{percent(times - 1)}"
-    return f"{float(f'{times:.2g}'):,g} times"
-
-
 def instrument_lines(findings: Iterable[Fault]) -> list[str]:
-    """Return a line per sensor finding: the signal, the finding, and how to correct it for good.
-
-    A signal that is not used gets one line, with its delay in it: nothing of it is corrected here.
-    """
-    findings = list(findings)
-    further = {one.signal: f"; {one.finding}" for one in findings if one.source and one.delay_s}
-    lines, findings = [], [one for one in findings if not (one.source and one.delay_s)]
-    unused = {one.signal: one for one in findings if one.kind == "smoothed"}
-    late = {one.signal for one in findings if one.kind == "delay"}
+    """Return a line per sensor finding: the signal, the finding, and how to correct it for good."""
+    lines = []
     for one in findings:
-        left_out = unused.get(one.signal)
-        if left_out and (one.kind == "lag" or (one is left_out and one.signal in late)):
-            continue  # `left_out` says how old it is, or is said with the delay
-        old = further.get(one.signal, "")  # beside what is said of its position
-        cut = one.kind == "unresolved"  # says so itself
-        done = "; corrected here" * (one.corrected and not (left_out or cut))
-        if left_out and one.kind == "delay":
-            done = f"; {left_out.finding}"
-        done += old
-        if one.mend is not None and "log" in one.mend.facts:  # says when to set it
-            lines.append(f"{one.signal}: {one.finding}{done}. {one.advice}")
-            continue
+        cut = one.kind in ("smoothed", "unresolved")  # is not used, which it says itself
+        done = "; corrected here" * (one.corrected and not cut)
         more = f"; to correct it for good, set {one.log} in its table of [log]" * bool(one.log)
         more += f"; {one.advice}" * bool(one.advice)
         lines.append(f"{one.signal}: {one.finding}{done}{more}")

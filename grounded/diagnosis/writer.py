@@ -22,9 +22,7 @@ from grounded.diagnosis.error_report import (
     objection,
     open_noise,
 )
-from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import correction
-from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import (
@@ -51,13 +49,13 @@ from grounded.diagnosis.validation.measured import (
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import acting_order, wrapping_order
 from grounded.findings import Finding, found
-from grounded.frozen import Array
 from grounded.places import position
 from grounded.result import number
 from grounded.task import Task
 
-MOST_EFFECTS, FURTHER = 12, 2  # most effects blamed at once; how many more the next search allows
+MOST_EFFECTS = 12  # most effects blamed at once
 NAMED = 2  # most parameters in the words of a cause
+MENTIONED = 2  # most effects that one group of trials shows
 
 
 class Writer:
@@ -175,9 +173,7 @@ class Writer:
         ties = [group for group in d.indistinguishable if group not in d.equivalent]
         doubt = objection(rows, d.agreement, d.effects, ties, d.leftover)
         step = next_step(d, self.claims, doubt, off, self.task, self.trials, self.adopted)
-        more: tuple[Finding, ...] = ()
-        if d.leftover and len(self.claims.names) == self.most and not d.no_cause:
-            more = (found("gap.more", most=self.most, deeper=d.verdict.look_for > 0),)
+        more = [found("gap.more", most=self.most)] * d.verdict.again
         return (*known, *more, *remarks(d, self.data.model, self.adopted), step)
 
     def verdict(
@@ -196,17 +192,13 @@ class Writer:
             bound = row is not None and (row.floor_at_most or row.floor_from == AT_MOST)
             unsure = bound and not excess(rows) and not self.adopted
             return Verdict("unknown" if remainder or unsure else "none")
-        more = 0
-        if remainder and len(claims.names) == self.most:
-            more = min(self.most + FURTHER, MOST_EFFECTS) * any(one.above for one in remainder)
         off = tuple(self.data.model.param_names[one.index] for one in claims.moved)
         return Verdict(
             "effect" if len(claimed) == 1 else "several",
             effects=claimed,
             causes=self.causes(ranking, credit, off),
             parameters=off,
-            look_for=more if more > self.most else 0,
-            again=0 < more <= self.most,
+            again=len(claims.names) == self.most and any(one.above for one in remainder),
         )
 
     def causes(
@@ -283,63 +275,27 @@ def _in_action(h: Hypothesis, claimed: Sequence[str]) -> tuple[str, ...]:
     return tuple(n for n in dict.fromkeys((*names, *claimed)) if n in claimed)
 
 
-MENTIONED = 2
-MEMORY = 1e-2  # fraction of a memory state's spread that stands in for its noise, which is zero
-
-
 def unconfirmed(
     claims: Claims,
     doubtful: Sequence[Doubtful],
     groups: Sequence[Sequence[str]] = (),
 ) -> tuple[Unconfirmed, ...]:
-    """Return the likeliest effects that were dropped and that few trials show, without ties.
+    """Return the likeliest effects that only one group of trials shows, without ties.
 
     Args:
         claims: the causes that are claimed.
         doubtful: the likely effects that were dropped.
         groups: effects that the data cannot tell apart.
     """
-    if claims.known.no_cause:
-        return ()
     tied = {name for group in groups for name in group}
-    left = [one for one in doubtful if one.name not in tied]
-    left = [one for one in left if one.name not in no_limits(claims.data, one.fit.hypothesis)]
-    found = [_seen(claims, one) for one in left]
-    return tuple([one for one in found if one is not None][:MENTIONED])
-
-
-def _seen(claims: Claims, one: Doubtful) -> Unconfirmed | None:
-    if not (few := one.one_group):
-        return None
-    data, acts = claims.data, acting(claims.predictor, one.fit, one.name)
-    by = np.bincount(data.trial_of, acts.sum(axis=0), data.count)
-    names = tuple(data.ids[k] or str(k + 1) for k in np.argsort(-by)[:few])
-    h = one.fit.hypothesis
-    i = h.names.index(one.name)
-    regions = by_region(acts, claims.predictor, one.fit, 1)
-    each = claims.estimates(one.fit)
-    if one.name in sizeless(h, np.array([e.std for some in each for e in some.values()])):
-        return None
-    return Unconfirmed(
-        one.name,
-        each[i],
-        one.nats,
-        names[0],
-        (few, data.count),
-        regions[0] if regions else None,
-        few > 1,
-        names,
-    )
-
-
-def acting(predictor: Predictor, fit: Fitted, name: str) -> Array:
-    """Return the squared change of each step by an effect, relative to the noise, (L, B)."""
-    data, h, x = predictor.data, fit.hypothesis, fit.track
-    less = h.minus(name)
-    moved = data.model.difference(predictor.next(less, x[:-1]), predictor.next(h, x[:-1]))
-    shown = np.zeros_like(x) + predictor.offset(h, x) - predictor.offset(less, x)
-    log_q, log_r = fit.noise.log_q.copy(), fit.noise.log_r.copy()
-    for i in data.hidden:  # its noise is zero, by which nothing can be divided
-        log_q[i] = log_r[i] = 2 * np.log(MEMORY * data.scales.spread(data.model.state_names[i]))
-    square = moved**2 / np.exp(log_q) + shown[1:] ** 2 / np.exp(log_r)
-    return np.asarray(square.sum(axis=-1) * data.valid.T)
+    found = [
+        Unconfirmed(
+            one.name,
+            claims.estimates(one.fit)[one.fit.hypothesis.names.index(one.name)],
+            one.nats,
+            tuple(claims.data.ids[k] or str(k + 1) for k in one.trials),
+        )
+        for one in doubtful
+        if one.name not in tied and not claims.known.no_cause
+    ]
+    return tuple(found[:MENTIONED])

@@ -30,7 +30,7 @@ from grounded.effects.family import (
     scales_of,
     wrapping_order,
 )
-from grounded.effects.joint import like_a_load, one_friction
+from grounded.effects.joint import one_friction
 from grounded.effects.memory import memory_of, memory_start
 from grounded.effects.plain_step import param_name
 from grounded.effects.registry import Library
@@ -54,7 +54,6 @@ __all__ = [
     "Site",
     "acting_order",
     "joining_order",
-    "like_a_load",
     "memory_of",
     "memory_start",
     "one_friction",

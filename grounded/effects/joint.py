@@ -19,7 +19,7 @@ the target `tau<-w+w2` (`drive`).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -175,40 +175,6 @@ def alone(model: Model, tau: str, w: str) -> bool:
     by, i = f_u[:, :, model.input_names.index(tau)], model.state_names.index(w)
     others = np.abs(np.delete(by, i, axis=1)).max(initial=0.0)
     return bool(others < ONLY * by[0, i] and np.ptp(by[:, i]) < ONLY * by[0, i])
-
-
-GAINS = ("input_gain", "rate_gain", "added_inertia")
-
-
-def like_a_load(model: Model, names: Collection[str]) -> bool:
-    """Check whether at least two of these effects look like a payload of an arm.
-
-    One such effect is a gear or a motor. Two or more on joints with coupled inertia suggest a
-    payload, or a wrong mass of a link, which changes the whole inertia matrix and gravity. Without
-    a parameter for it, gains imitate it. If an uncertain parameter changes the inertia, it was free
-    beside these effects, and they are what they claim to be.
-    """
-    gains = {name for name in names if name.partition(":")[0] in GAINS}
-    if len(gains) < 2 or _uncertain_inertia(model):
-        return False
-    drives = [pair.split("<-") for pair in pairs_of(model)]
-    coupled = [(tau, w) for tau, w in drives if "+" not in w and not alone(model, tau, w)]
-    said = {f"input_gain:{tau}" for tau, _ in coupled} | {f"rate_gain:{w}" for _, w in coupled}
-    said |= {f"added_inertia:{tau}<-{w}" for tau, w in coupled}
-    return len(said & gains) > 1
-
-
-def _uncertain_inertia(model: Model) -> bool:
-    """Check whether an uncertain parameter (even one at zero) changes accelerations by inputs."""
-    dt, (x, u) = places.probe(model, 1e-2), places.samples(model, 8)
-
-    def pushes(values: Array) -> Array:
-        return np.asarray(model.system.linearise(x, u, values, dt)[1])
-
-    before, spreads = pushes(model.values), [p.spread for p in model.params.values()]
-    moved = [step for step in np.diag(VARIED_BY * np.array(spreads)) if step.any()]
-    most = ONLY * VARIED_BY * np.abs(before).max()
-    return any(np.abs(pushes(model.values + step) - before).max() > most for step in moved)
 
 
 def renamed(model: Model) -> dict[str, str]:

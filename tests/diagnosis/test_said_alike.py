@@ -130,7 +130,7 @@ def test_errors_that_grow_and_values_at_bounds_are_told():
     said = {one.code: one for one in remarks(found, MODEL)}
     assert said["gap.worse"].facts["state"] == "x" and said["model.at_bound"].about == ("a",)
     gain = Ranked("input_gain:u", {"g": Estimate(9.0, 0.1)}, {}, 9.0, claimed=True)
-    assert "unit" in codes(diagnosed(ranking=(gain,)))
+    assert "sign" not in codes(diagnosed(ranking=(gain,)))
     turned = replace(gain, params={"g": Estimate(-2.0, 0.1)})
     assert "sign" in codes(diagnosed(ranking=(turned,)))
     assert "one_motion" in codes(diagnosed(motions=1, leftover=(Remainder("v", 0.1),)))

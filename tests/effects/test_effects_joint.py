@@ -1,7 +1,6 @@
 """What a motion takes off the input that drives it: in small steps, wrapped, and in MuJoCo."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Library, wrap
-from grounded.effects.joint import FAMILIES, like_a_load, pairs_of
+from grounded.effects.joint import FAMILIES, pairs_of
 from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
@@ -142,20 +141,3 @@ def test_no_joint_is_made_of_what_drives_one_axis_or_is_tilted():
     assert pairs_of(Model(states=states, inputs=inputs, derivative=flown)) == []
     for model in (car, aircraft, replace(pendulum, inputs={"torque": "1"})):
         assert pairs_of(model) == []
-
-
-def test_gains_of_several_joints_of_an_arm_are_like_a_load():
-    (tau, w), (other, _) = (pair.split("<-") for pair in PAIRS)
-    known = replace(arm, params={"m2": Param(1.0, "kg")})
-    assert like_a_load(known, [f"input_gain:{other}", f"rate_gain:{w}", f"delay:{tau}"])
-    gains = [f"input_gain:{tau}", f"added_inertia:{PAIRS[1]}"]
-    assert like_a_load(known, gains)
-    assert not like_a_load(known, [f"input_gain:{tau}", f"joint_friction:{PAIRS[1]}"])
-    assert not like_a_load(arm, gains)  # its mass was free beside them
-    load = replace(
-        arm,
-        params={"m2": Param(1.0, "kg"), "load": Param(0.0, "kg", std=0.3)},
-        derivative=lambda s, a, p: dynamics(s, a, SimpleNamespace(m2=p.m2 + p.load)),
-    )
-    assert not like_a_load(load, gains)  # nor one that is zero in the model
-    assert not like_a_load(pendulum, ["input_gain:torque", "rate_gain:omega"])

@@ -44,12 +44,12 @@ REFIT = 12  # iterations after a cause was removed
 
 @dataclass(frozen=True, eq=False)
 class Doubtful:
-    """A likely effect that is not claimed: predictions gain too little, or one group shows it."""
+    """A likely effect that is not claimed, since only one group of trials shows it."""
 
     name: str
     nats: float
     fit: Fitted  # including the effect
-    one_group: int = 0  # trials of the only group that shows it
+    trials: tuple[int, ...]  # of the group
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,7 +213,7 @@ class Options:
             self._known[own] = Option(own, evidence, self.ruler.errors(fit), order)
         return self._known[own]
 
-    def _vague(self, own: frozenset[str]) -> list[str]:
+    def vague_alone(self, own: frozenset[str]) -> list[str]:
         """Return the effects of a set that have no size by its own fit; parameters have priors."""
         if own not in self._sizeless:
             fit = self.fits[own]
@@ -240,7 +240,7 @@ class Options:
         """
         fit, search = self.fits[option.causes], self.search
         own = self._fitted_without(option.causes, cause)
-        if own is None or cause in self._vague(option.causes):
+        if own is None or cause in self.vague_alone(option.causes):
             return None
         less = self.fits[own]
         cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
@@ -263,8 +263,8 @@ def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
     return [name for (name, param), value in params if param.stopped(float(value))]
 
 
-def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> int:
-    """Return the number of trials of the only group that shows an effect; 0 if several do.
+def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> tuple[int, ...]:
+    """Return the trials of the only group that shows an effect; none if several do.
 
     By the trials outside that group, it has no size. Where all trials are of one group, no effect
     can be asked for a second one but those that name no mechanism: along one motion, any error of
@@ -276,25 +276,25 @@ def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> int:
     family, own = h.effects[i].family, h.sizes[i]
     several = len(data.groups) > 1 and not isinstance(family, ParamFamily)
     if not (family.loose or several):
-        return 0
+        return ()
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]
     for g, shift in zip(np.unique(group), leave_one_out(fit, group), strict=True):
         others = worth * fit.gram[group != g].sum(axis=0) + np.diag(fit.prior)
         if (np.abs(h.theta[own] + shift[own]) < SURE * fisher(others)[own]).all():
-            return len(np.unique(data.trial_of[group == g]))
-    return 0
+            return tuple(np.unique(data.trial_of[group == g]).tolist())
+    return ()
 
 
 def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, ...]:
-    """Return the effects that are likely beside the choice but not supported, likeliest first."""
+    """Return the effects that are likely beside the choice but in one group, likeliest first."""
     found, own, search = list[Doubtful](), choice.chosen.causes, options.search
     for option in rule.options if rule.held_out else ():
         nats = option.evidence - choice.chosen.evidence
         if own < option.causes and len(option.causes) == len(own) + 1 and nats > NATS:
             (name,) = option.causes - own
             fit = options.fits[option.causes]
-            if name in equations(fit) and rule.unsupported(option):
-                alone = one_group(search, fit, name)
+            sized = name in equations(fit) and name not in options.vague_alone(option.causes)
+            if sized and (alone := one_group(search, fit, name)):
                 found.append(Doubtful(name, nats, fit, alone))
     return tuple(sorted(found, key=lambda one: -one.nats))
 

@@ -13,7 +13,6 @@ region is a half-space of one state or input with a large share of the gain in l
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cached_property
@@ -46,7 +45,6 @@ from grounded.trial import Trial
 
 # of all errors: at most this share is in a part that holds most of those above the noise
 SMALL_PART = 0.2
-MOST_LOST = 20.0  # log of a ratio of errors beyond which a model diverges
 
 
 class Measured:
@@ -226,8 +224,7 @@ class Measured:
         found = []
         for name, fit in without:
             errors = dict(zip(self.units, self.rms(fit)[k].tolist(), strict=True))
-            times = math.exp(min(lost[name], MOST_LOST))
-            found.append(Credit(name, lost[name] / whole, errors, times))
+            found.append(Credit(name, lost[name] / whole, errors))
         return tuple(sorted(found, key=lambda one: -one.share))
 
     def remainders(self) -> tuple[Remainder, ...]:

@@ -73,8 +73,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "unconfirmed": Entry(
         "note",
-        "unconfirmed: {effect} ({values}), which {seen} of {trials} trials show"
-        "[[repeats?, all of one motion]][[, mostly {trial}]][[ where {place}]]",
+        "unconfirmed: {effect} ({values}), which {seen} of {trials} trials show, all of one group",
     ),
     "small": Entry(
         "note",
@@ -95,7 +94,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "[[{most:cause} {most:is/are} named, as many as were looked for, and more is left]]"
         "[[interrupted? interrupted while it looked for one more effect]]",
-        "[[deeper? allow more with --max-effects]][[!deeper? adopt these and diagnose again]]",
+        "adopt these and diagnose again, or allow more with --max-effects",
     ),
     "sign": Entry(
         "warn",
@@ -103,7 +102,6 @@ ENTRIES: dict[str, Entry] = {
         "flip its sign in model.py; if only the log has it so, multiply the scale in "
         f"[log.input.{{input}}] by -1 and ingest the logs again; {DIAGNOSE}",
     ),
-    "unit": Entry("warn", "{effect} is about a power of ten: is the log in another unit?"),
     "corrected": Entry(
         "warn",
         "corrected here, but not in the stored trials: {about}",
@@ -136,17 +134,6 @@ ENTRIES: dict[str, Entry] = {
         "the robot changed between the two groups: adopt no value of both",
         "diagnose the newer trials alone",
     ),
-    "next.load": Entry(
-        "note",
-        "several joints with a wrong gain suggest a load or a wrong link mass",
-        f"give the model a parameter for it, {DIAGNOSE}",
-    ),
-    "next.bounds": Entry(
-        "note",
-        "{about} stopped at {about:its/their} bound, and the trials ask for more",
-        "widen it in the model file if the true value may lie beyond; else give bounds to a "
-        f"parameter that is constant; {DIAGNOSE}",
-    ),
     "next.flip": Entry("note", f"flip the sign of {{input}}, {DIAGNOSE}"),
     "next.apart": Entry(
         "note",
@@ -155,8 +142,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.confirm": Entry(
         "note",
-        "run another trial that shows {effect}[[, where {place}]][[repeats?  in another motion]]: "
-        "few do[[ ({trial} best)]]",
+        "run a trial of another motion or condition that shows {effect}",
     ),
     "next.look": Entry(
         "note",

@@ -91,20 +91,22 @@ def test_an_effect_of_every_run_is_not_unconfirmed_because_one_log_is_long():
     claims.predictor = search.predictor
     claims.estimates = lambda fit: [{"b": Estimate(0.3, 0.01)}]
 
-    def seen(name, values, groups=(), alone=None):
+    def fitted(name, values):
         effect = Library().effect(name, better, data.scales)
         (fit,) = search.refined([search.fresh(Hypothesis().plus(effect, values))], 1)
-        trials = one_group(search, fit, name) if alone is None else alone
-        return unconfirmed(claims, [Doubtful(name, 50.0, fit, trials)], groups)
+        return fit
 
-    assert seen("sensor_bias:v", {"b": 0.3}) == ()
+    def seen(name, values, groups=()):
+        return unconfirmed(claims, [Doubtful(name, 50.0, fitted(name, values), (3,))], groups)
+
+    assert one_group(search, fitted("sensor_bias:v", {"b": 0.3}), "sensor_bias:v") == ()
     once = replace(lifted[0], inputs=0 * lifted[0].inputs)
     data = claims.data = prepare(better, [once, once, once, lifted[1]], hidden=memory)
     search = HypothesisSearch(data, ())
     claims.predictor = search.predictor
-    (gain,) = seen("input_gain:u", {"g": 0.3}, alone=1)
-    assert gain.seen == (1, 4) and gain.trial == "4"
-    assert seen("input_gain:u", {"g": 0.3}, [("parameter:k", "input_gain:u")], 1) == ()
+    (gain,) = seen("input_gain:u", {"g": 0.3})
+    assert gain.trials == ("4",)
+    assert seen("input_gain:u", {"g": 0.3}, [("parameter:k", "input_gain:u")]) == ()
 
 
 def late(trials, steps=400, delay=1.5 * DT):

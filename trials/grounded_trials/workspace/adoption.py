@@ -21,11 +21,10 @@ from grounded.diagnosis.causes import sign_only
 from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.effects import param_name
-from grounded.effects.joint import like_a_load
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.fit import Fit
-from grounded.model import Model, all_at_bounds
+from grounded.model import Model
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
 from grounded.trial import Trial
@@ -154,20 +153,16 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     alone = NextCommand("adopt", late) if late else None
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
-    load = len(new) > 1 and like_a_load(workspace.planner.plan.model, new)
-    if not claimed or {*new} <= undone or load:
+    if not claimed or {*new} <= undone:
         return alone
 
-    # A bound is widened, or a sign flipped, before anything is adopted, as the diagnosis says.
-    params = workspace.base_model.params
-    off = {n: e.value for n, e in diagnosis.parameters.items() if n in diagnosis.verdict.parameters}
-    ended = all_at_bounds(params, {n: value for n, value in off.items() if n in params})
+    # A sign is flipped before anything is adopted, as the diagnosis says.
     rows = (row for row in diagnosis.ranking if row.effect in new)
-    if ended or any(sign_only(row.effect, row.params) for row in rows):
+    if any(sign_only(row.effect, row.params) for row in rows):
         return AGAIN
 
     # Only parameters: they are all fitted together, unless that was done without a gain.
-    if {f"parameter:{name}" for name in params}.issuperset(new):
+    if {f"parameter:{name}" for name in workspace.base_model.params}.issuperset(new):
         some = (*made.named, *made.compared)
         if not table.effects and not fitted_in_vain(workspace, some):  # else adopted beside them
             return NextCommand("fit", ("--trials", ",".join(some)) if some else ())

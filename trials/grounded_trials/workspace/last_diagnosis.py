@@ -220,7 +220,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
         missing=missing if adopted else (),
         changed=not same or made.model not in ("", model_print(workspace)),
         reread=changed_since(workspace, diagnosis, usable),
-        further=diagnosis.verdict.look_for > 0 or diagnosis.verdict.again,
+        further=diagnosis.verdict.again,
     )
 
 
