@@ -17,9 +17,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_records import Schema
-from grounded_trials.formats.mcap_writer import file_descriptor_set
-from grounded_trials.formats.protobuf import message_class
-from grounded_trials.formats.schemas import parse_protobuf, struct_of
+from grounded_trials.formats.protobuf import file_descriptor_set, numbers_in
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 from rewriting import with_metadata
@@ -186,11 +184,10 @@ def test_our_own_definitions_are_known_without_the_library(
     names: list[str], repeated: bool
 ) -> None:
     data = file_descriptor_set("State", names, repeated=repeated)
-    wanted = parse_protobuf(data, "grounded.State")
-    found = struct_of(Schema(1, "grounded.State", "protobuf", data))
-    assert found.name == wanted.name
-    assert [vars(f) for f in found.fields] == [vars(f) for f in wanted.fields]
-    assert message_class(data, "grounded.State")
+    found = numbers_in(Schema(1, "grounded.State", "protobuf", data))
+    assert found == {name: (i, repeated) for i, name in enumerate(names, start=1)}
+    other = file_descriptor_set("State", names, repeated=repeated).replace(b"proto3", b"proto2")
+    assert numbers_in(Schema(1, "grounded.State", "protobuf", other)) == found
 
 
 def test_a_live_trial_on_a_full_disk_says_so() -> None:

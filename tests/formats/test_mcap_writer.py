@@ -7,13 +7,8 @@ import pytest
 from mcap.writer import CompressionType, Writer
 
 from grounded_trials.formats.mcap_records import Header
-from grounded_trials.formats.mcap_writer import (
-    CHUNK_SIZE,
-    McapWriter,
-    encode_doubles,
-    encode_lists,
-    file_descriptor_set,
-)
+from grounded_trials.formats.mcap_writer import CHUNK_SIZE, McapWriter
+from grounded_trials.formats.protobuf import encode_doubles, encode_lists, file_descriptor_set
 
 TABLE, ABOUT = {"kind": "candidate", "units": "m, °"}, "A text, ä.".encode()
 CHANNELS = (

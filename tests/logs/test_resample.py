@@ -29,7 +29,6 @@ def series(
         log_times=stamps + round(log_delay * 1e9),
         messages=len(stamps),
         type="a/B",
-        stamped=True,
     )
 
 

@@ -68,7 +68,7 @@ def test_a_delay_is_no_surer_than_states_between_two_samples(samples=0.02):
     for name, (t, y) in lagging(samples).items():
         stamps = np.round(1e9 * t).astype(np.int64)
         spec = SignalSpec(f"/{name}.data")
-        series[name] = Series(spec, stamps, y, stamps, len(t), "a/B", stamped=True)
+        series[name] = Series(spec, stamps, y, stamps, len(t), "a/B")
     log = to_grid(series, 0.05, ["w"], ["u"])
     assert log.interpolated_s == pytest.approx(0.0025 if samples == 0.02 else 0.0, abs=1e-4)
     motor = Model(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tomllib
 
 import numpy as np
@@ -9,9 +10,9 @@ import pytest
 
 from facts import holding
 from grounded.errors import GroundedError
-from grounded_trials.formats.messages import Dynamic
+from grounded_trials.formats.mcap_records import Channel, Schema
+from grounded_trials.formats.messages import decoder_of
 from grounded_trials.formats.path_walk import number_paths
-from grounded_trials.formats.schemas import parse_ros
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import inspect_log, opposite_signals
@@ -88,19 +89,23 @@ def test_number_paths() -> None:
         + "=" * 80
         + "\nMSG: x/Q\nfloat64 x\nfloat64 y\nfloat64 z\nfloat64 w\n"
     )
+    schema = Schema(1, "x/msg/M", "ros2msg", text.encode())
+    message = b"\0\1\0\0" + struct.pack("<III4s", 0, 0, 1, b"") + bytes(8 * (36 + 2 + 4))
+    message += struct.pack("<I4x", 1) + bytes(32) + struct.pack("<I1s", 1, b"")
+    one = decoder_of(Channel(1, "/t", "cdr", 1, {}), schema).decode(message)
     angles = [".@rpy.roll", ".@rpy.pitch", ".@rpy.yaw", ".x", ".y", ".z", ".w"]
-    assert number_paths(parse_ros(text, "x/msg/M", ros1=False)) == [
+    assert number_paths(one) == [
         ".pair[0]",
         ".pair[1]",
         *(".q" + a for a in angles),
         *(".many[0]" + a for a in angles),
     ]
     sample = {"a": 1, "b b": [True, {"c": 2.5}], "t": "text", "n": None}
-    assert number_paths(Dynamic(), sample) == [".a", '."b b"[0]', '."b b"[1].c']
+    assert number_paths(sample) == [".a", '."b b"[0]', '."b b"[1].c']
     deep: dict[str, object] = {}
     for _ in range(50):
         deep = {"d": deep, "v": 1}
-    assert len(number_paths(Dynamic(), deep)) < 20
+    assert len(number_paths(deep)) < 20
 
 
 def test_signals_of_opposite_sign() -> None:

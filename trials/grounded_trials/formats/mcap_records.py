@@ -86,6 +86,15 @@ class Messages:
         return Messages(self.buffer, *(column[chosen] for column in columns))
 
 
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """The rows of a table, as the messages of a channel with the encoding "table"."""
+
+    channel: int
+    times: NDArray[np.int64]  # (N,) [ns]
+    columns: dict[str, NDArray[np.float64]]  # (N,) each; q[0], q[1] ... are an array
+
+
 @dataclass(frozen=True)
 class Attachment:
     """A named file inside the file."""
@@ -112,7 +121,7 @@ class End:
     data_crc: bool
 
 
-Record = Header | Schema | Channel | Messages | Attachment | Metadata | End
+Record = Header | Schema | Channel | Messages | Rows | Attachment | Metadata | End
 
 
 def windows(buffer: bytes, dtype: str) -> NDArray[np.generic]:

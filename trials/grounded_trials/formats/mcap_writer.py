@@ -4,9 +4,6 @@ The bytes are those that the mcap package writes, which takes seven times as lon
 import: a quarter of `propose` for an aircraft, whose candidate has 9,001 messages. Files of ours
 are not compressed: they are small, their numbers compress badly, and without compression equal
 input gives equal bytes whatever the version of the compressor.
-
-Ours hold protobuf messages of doubles, numbered from 1. Zeros are written as well, so that all
-messages of a channel have the same length and -0.0 is preserved.
 """
 
 from __future__ import annotations
@@ -14,12 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from struct import Struct, pack
-from typing import IO, Any
+from typing import IO
 from zlib import crc32
 
-import numpy as np
-
-from grounded.frozen import Array
 from grounded_trials.formats.mcap_records import (
     ATTACHMENT,
     CHANNEL,
@@ -36,7 +30,7 @@ from grounded_trials.formats.mcap_records import (
     Header,
     Messages,
 )
-from grounded_trials.formats.protobuf import double_tag, doubles_tag, varint
+from grounded_trials.formats.protobuf import file_descriptor_set
 
 LIBRARY = "grounded"
 CHUNK_SIZE = 1024 * 1024  # [bytes] after which a chunk ends
@@ -238,54 +232,3 @@ def _text(text: str) -> bytes:
 def _map(table: Mapping[str, str]) -> bytes:
     data = b"".join(_text(key) + _text(value) for key, value in table.items())
     return pack("<I", len(data)) + data
-
-
-def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:
-    """Return a serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1.
-
-    It is written by hand, with the numbers of google/protobuf/descriptor.proto, to avoid the slow
-    import of the protobuf package.
-    """
-    label, double = (3 if repeated else 1), 1  # LABEL_REPEATED, LABEL_OPTIONAL; TYPE_DOUBLE
-    fields = [
-        _bytes(1, name.encode()) + _integer(3, number) + _integer(4, label) + _integer(5, double)
-        for number, name in enumerate(names, start=1)
-    ]
-    definition = _bytes(1, message.encode()) + b"".join(_bytes(2, field) for field in fields)
-    name = f"grounded/{message}.proto".encode()
-    file = _bytes(1, name) + _bytes(2, b"grounded") + _bytes(4, definition) + _bytes(12, b"proto3")
-    return _bytes(1, file)
-
-
-def encode_doubles(values: Array) -> list[bytes]:
-    """Return messages of doubles for rows of numbers (N, count)."""
-    tags = [double_tag(number) for number in range(1, values.shape[1] + 1)]
-    return _joined(list(zip(tags, values.T[:, :, None], strict=True)))
-
-
-def encode_lists(lists: Sequence[Array]) -> list[bytes]:
-    """Return messages of packed lists of doubles.
-
-    Args:
-        lists: one array (N, count) per field, with a row for each message; a field with count 0
-            is left out.
-    """
-    fields = enumerate(lists, start=1)
-    return _joined([(doubles_tag(n, v.shape[1]), v) for n, v in fields if v.shape[1]])
-
-
-def _joined(fields: Sequence[tuple[bytes, Array]]) -> list[bytes]:
-    """Return messages of fields, each a constant prefix followed by the row's doubles (N, ...)."""
-    parts = list[np.ndarray[Any, np.dtype[np.uint8]]]()
-    for prefix, values in fields:
-        data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
-        parts += [np.tile(np.frombuffer(prefix, np.uint8), (len(values), 1)), data]
-    return [row.tobytes() for row in np.hstack(parts)]
-
-
-def _bytes(number: int, data: bytes) -> bytes:
-    return varint(number << 3 | 2) + varint(len(data)) + data
-
-
-def _integer(number: int, value: int) -> bytes:
-    return varint(number << 3) + varint(value)

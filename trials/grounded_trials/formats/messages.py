@@ -1,268 +1,211 @@
-"""The contents of messages, whatever their encoding: a tree of types, and nodes that walk it.
+"""The contents of messages as Python objects, whatever their encoding.
 
-A definition in ROS, IDL or protobuf becomes a `Type`: numbers, texts, structs and arrays of these.
-A `Node` is one place of that tree in many messages at once: row i is a value in message `rows[i]`.
-`field` goes into a struct, `items` into an array (a message then has as many rows as items, or
-none), `keep` drops rows; `numbers` and `equals` read the values. The nodes in `cdr.py` decode bytes
-by array operations; those for JSON, here, and in `protobuf.py` hold messages parsed one by one.
+rosbags decodes CDR (ROS 2) and ROS 1 messages, Google's library protobuf, and Python's JSON: one
+by one, about 10 us a message. The rows of a table are one object whose numbers are columns.
+`path_walk` finds numbers in them.
 """
 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, Self
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded_trials.formats.bad import BadMessage, BadPath
-
-
-@dataclass(frozen=True)
-class Number:
-    """A number of a NumPy kind without byte order: f8, f4, i1 .. i8, u1 .. u8, b1."""
-
-    kind: str
-
-    @property
-    def size(self) -> int:
-        """Size on the wire [bytes]."""
-        return int(self.kind[1:])
-
-    def __str__(self) -> str:
-        word = {"f": "float", "i": "int", "u": "uint", "b": "bool"}[self.kind[0]]
-        return word if word == "bool" else f"{word}{8 * self.size}"
-
-
-@dataclass(frozen=True)
-class Text:
-    """A string; `unit` is the size of a character on the wire (0: not standardised)."""
-
-    unit: int = 1
-
-    def __str__(self) -> str:
-        return "string" if self.unit == 1 else "wstring"
-
-
-@dataclass(frozen=True)
-class Array:
-    """Items of one type: a fixed `count`, or as many as the message states (None)."""
-
-    item: Type
-    count: int | None = None
-
-    def __str__(self) -> str:
-        return f"{self.item}[{'' if self.count is None else self.count}]"
-
-
-@dataclass(frozen=True, eq=False)
-class Field:
-    """A named member of a struct; `number` is that of protobuf."""
-
-    name: str
-    type: Type
-    number: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Struct:
-    """Named fields in wire order. Recursive types (protobuf) refer to the same object."""
-
-    name: str
-    fields: tuple[Field, ...]
-    definition: bytes | None = None  # of protobuf, serialised
-
-    @cached_property
-    def by_name(self) -> dict[str, Field]:
-        """Field by name."""
-        return {f.name: f for f in self.fields}
-
-    def __str__(self) -> str:
-        return self.name
-
-
-@dataclass(frozen=True)
-class Dynamic:
-    """A value whose type is known only from the message (JSON)."""
-
-    def __str__(self) -> str:
-        return "value"
-
-
-Type = Number | Text | Array | Struct | Dynamic
-
-DEPTH_LIMIT, COUNT_LIMIT = 64, 10**8  # nesting of types; items of an array
-_KINDS = {"int": ("i", 1, 2, 4, 8), "uint": ("u", 1, 2, 4, 8), "float": ("f", 4, 8)}
-NUMBERS = {  # by their ROS names: int8 ... float64
-    f"{word}{8 * size}": Number(f"{kind}{size}")
-    for word, (kind, *sizes) in _KINDS.items()
-    for size in sizes
-} | {"bool": Number("b1"), "char": Number("u1")}
+from grounded_trials.formats.bad import BadMessage, BadSchema
+from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema
+from grounded_trials.formats.protobuf import message_class, spelled, unspelled
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
+PIECE = 2**20  # [bytes] of messages decoded at once, at least one: objects take much memory
+ABSENT = object()  # what a message has in place of a field that was not sent
+
 
 @dataclass(frozen=True, eq=False)
-class Node:
-    """One value of `type` in each row; rows are sorted by message."""
+class Decoded:
+    """Messages of one topic, or the rows of a table: N in all."""
 
-    type: Type
-    rows: Ints
+    objects: Sequence[Any]  # N of them; of a table one
+    log_times: Ints  # (N,) [ns]
+    publish_times: Ints  # (N,) [ns]
+    is_table: bool = False
 
-    def field(self, name: str) -> Node:
-        """Return the node of a struct's field, without the rows where it is absent."""
-        raise NotImplementedError
-
-    def items(self, start: int, stop: int) -> Node:
-        """Return array items from start to stop, both included; negative counts from the end."""
-        raise NotImplementedError
-
-    def pick(self, index: Ints) -> Self:
-        """Return these rows, in this order; a row may occur several times."""
-        arrays = ((k, v) for k, v in vars(self).items() if isinstance(v, np.ndarray))
-        columns: dict[str, Any] = {name: column[index] for name, column in arrays}
-        return replace(self, **columns)
-
-    def keep(self, chosen: Bools) -> Self:
-        """Return the rows where `chosen` is true."""
-        return self.pick(np.flatnonzero(chosen))
-
-    def numbered(self, rows: Ints) -> Self:
-        """Return the same values with other row numbers."""
-        return replace(self, rows=rows)
-
-    def sample(self) -> Any:
-        """Return the first row's parsed value if the type is dynamic (JSON), else None."""
-        return None
-
-    def names(self) -> tuple[str, ...]:
-        """Return the field names of a struct."""
-        return tuple(self.type.by_name) if isinstance(self.type, Struct) else ()
-
-    def numbers(self) -> Floats:
-        """Return the values of a number, one per row."""
-        raise NotImplementedError
-
-    def equals(self, text: str) -> Bools:
-        """Return where a text equals `text`."""
-        raise NotImplementedError
-
-    def texts(self) -> list[str]:
-        """Return the texts, one per row."""
-        raise NotImplementedError
+    @property
+    def samples(self) -> Sequence[Any]:
+        """The first and the last message, or a table's first row."""
+        if not self.is_table:
+            return [self.objects[0], self.objects[-1]]
+        columns = self.objects[0].items()
+        return [{k: [0.0] * len(v) if isinstance(v, list) else 0.0 for k, v in columns}]
 
 
-def choose_items(counts: Ints, start: int, stop: int) -> tuple[Ints, Ints]:
-    """Return the items that a slice selects, as (row, index), for arrays of counts[row] items.
+@dataclass(frozen=True, eq=False)
+class Decoder:
+    """Decodes a topic's messages."""
 
-    Both ends are included and negative ones count from the end, as in Foxglove; indices outside
-    the array are left out.
-    """
-    first = np.maximum(counts + start, 0) if start < 0 else np.full_like(counts, start)
-    last = counts + stop if stop < 0 else np.minimum(counts - 1, stop)
-    if start == stop and start < 0:  # one item from the end: none where the array is too short
-        first = counts + start
-        last = np.where(first < 0, first - 1, first)
-    lengths = np.maximum(last - first + 1, 0)
-    rows = np.repeat(np.arange(len(counts)), lengths)
-    offset = np.arange(len(rows)) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    return rows, first[rows] + offset
+    topic: str
+    name: str  # of the message type
+    decode: Callable[[bytes], Any] = field(repr=False)
+
+    def parts(self, batch: Messages | Rows) -> Iterator[Decoded]:
+        """Yield the contents of messages, or of a table's rows, in pieces.
+
+        Raises:
+            BadMessage: for a message that is not of its type, with its index in the piece.
+        """
+        if isinstance(batch, Rows):
+            yield Decoded([_nested(batch.columns)], batch.times, batch.times, is_table=True)
+            return
+        piece = np.cumsum(batch.ends - batch.starts) // PIECE
+        for number in range(int(piece[-1]) + 1 if len(piece) else 0):
+            first, last = np.searchsorted(piece, [number, number + 1])
+            objects = list[Any]()
+            for i in range(first, last):
+                try:
+                    objects.append(self.decode(batch.buffer[batch.starts[i] : batch.ends[i]]))
+                except MemoryError:
+                    raise
+                except Exception as error:  # each library has its own
+                    why = _short(error)
+                    raise BadMessage(len(objects), "decode", what="message", why=why) from None
+            if objects:
+                times = batch.log_times[first:last], batch.publish_times[first:last]
+                yield Decoded(objects, *times)
 
 
-def texts_equal(buffer: bytes, start: Ints, length: Ints, text: bytes) -> Bools:
-    """Return where the `length` bytes at `start` are exactly `text`."""
-    equal: Bools = length == len(text)
-    octets = np.frombuffer(buffer, dtype=np.uint8)
-    at = np.flatnonzero(equal)
-    for i, octet in enumerate(text):
-        at = at[octets[start[at] + i] == octet]
-    result = np.zeros(len(start), dtype=np.bool_)
-    result[at] = True
-    return result
+def _short(error: Exception) -> str:
+    return " ".join(str(error).split())[:80] or type(error).__name__
 
 
-def json_messages(buffer: bytes, start: Ints, end: Ints) -> Node:
-    """Return the root node of JSON messages at buffer[start[i]:end[i]].
+def _nested(columns: dict[str, Floats]) -> dict[str, Any]:
+    """Return columns by name, those called q[0], q[1] ... as a list q."""
+    table: dict[str, Any] = {}
+    for name, column in columns.items():
+        bare, bracket, _ = name.partition("[")
+        if bracket and bare not in columns:
+            table.setdefault(bare, []).append(column)
+        else:
+            table[name] = column
+    return table
 
-    null is read as NaN, which JSON does not have; NaN itself is accepted too, since some programs
-    write it.
+
+def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
+    """Return the decoder of a channel.
 
     Raises:
-        BadMessage: for a message that is not JSON.
+        BadSchema: if its encoding is not one of cdr, ros1, protobuf, json, or its schema is bad.
     """
-    objects = []
-    for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
-        try:
-            objects.append(json.loads(buffer[a:b]))
-        except (ValueError, RecursionError) as error:
-            raise BadMessage(i, "decode", what="JSON", why=str(error)) from None
-    return _JsonNode(Dynamic(), np.arange(len(objects)), as_array(objects))
+    encoding, name = channel.encoding, schema.name if schema else ""
+    if encoding in ("json", "table"):
+        return Decoder(channel.topic, name or encoding, json.loads)
+    if encoding not in ("cdr", "ros1", "protobuf"):
+        raise BadSchema("decode", what="encoding", at=encoding)
+    if schema is None:
+        raise BadSchema("decode", what="schema", at=encoding)
+    if encoding == "protobuf":
+        return Decoder(channel.topic, name, message_class(schema.data, name).FromString)
+    return Decoder(channel.topic, name, _ros(schema, encoding))
 
 
-@dataclass(frozen=True, eq=False)
-class ObjectNode(Node):
-    """Row i is the parsed value objects[i]; an object without a field has no row there."""
-
-    objects: NDArray[np.object_]
-
-    def among(self, kind: Type, rows: Ints, objects: list[Any]) -> Self:
-        """Return the node of values inside those of this one."""
-        return replace(self, type=kind, rows=rows, objects=as_array(objects))
-
-    def items(self, start: int, stop: int) -> Self:
-        """Return items of lists; whatever else there is has none."""
-        none = (str, dict, int, float, type(None))
-        counts = [0 if isinstance(o, none) else len(o) for o in self.objects]
-        row, index = choose_items(np.array(counts, dtype=np.int64), start, stop)
-        pairs = zip(row.tolist(), index.tolist(), strict=True)
-        kind = self.type.item if isinstance(self.type, Array) else self.type
-        return self.among(kind, self.rows[row], [self.objects[i][j] for i, j in pairs])
-
-    def equals(self, text: str) -> Bools:
-        """Return where a text, or its bytes, equals `text`."""
-        return np.array([o in (text, text.encode()) for o in self.objects], dtype=np.bool_)
-
-    def texts(self) -> list[str]:
-        """Return the objects as texts."""
-        return list(map(str, self.objects))
+# What the objects are
 
 
-@dataclass(frozen=True, eq=False)
-class _JsonNode(ObjectNode):
-    def sample(self) -> Any:
-        """Return the first message, parsed."""
-        return self.objects[0]
-
-    def names(self) -> tuple[str, ...]:
-        """Return the names in the first row that is an object."""
-        return next((tuple(o) for o in self.objects if isinstance(o, dict)), ())
-
-    def field(self, name: str) -> _JsonNode:
-        index = [i for i, o in enumerate(self.objects) if isinstance(o, dict) and name in o]
-        rows = self.rows[np.array(index, dtype=np.int64)]
-        return self.among(self.type, rows, [self.objects[i][name] for i in index])
-
-    def numbers(self) -> Floats:
-        values = np.empty(len(self.objects))
-        for i, o in enumerate(self.objects):
-            if o is not None and not isinstance(o, int | float):
-                at = f"message {self.rows[i]}"
-                raise BadPath("path", expected="number", found=type(o).__name__, at=at)
-            values[i] = np.nan if o is None else _as_float(o)
-        return values
+def names_in(value: Any) -> tuple[str, ...]:
+    """Return the field names of an object, () if it is none."""
+    if isinstance(value, dict):
+        return tuple(value)
+    if is_dataclass(value):
+        return tuple(one.name for one in fields(value) if one.name != "__msgtype__")
+    described = getattr(value, "DESCRIPTOR", None)
+    return tuple(unspelled(one.name) for one in described.fields) if described else ()
 
 
-def as_array(objects: list[Any]) -> NDArray[np.object_]:
-    """Return a list as an array of objects (N,)."""
-    return np.fromiter(objects, np.object_, len(objects))
+def fields_of(values: Sequence[Any], name: str) -> list[Any]:
+    """Return a field of objects of one kind; ABSENT where it was not sent."""
+    first = next(iter(values), None)
+    if first is None or isinstance(first, dict):
+        return [v.get(name, ABSENT) if isinstance(v, dict) else ABSENT for v in values]
+    if not hasattr(first, "HasField"):
+        return [getattr(value, name) for value in values]
+    inner = [getattr(value, spelled(name)) for value in values]
+    if hasattr(inner[0], "HasField"):
+        pairs = zip(values, inner, strict=True)
+        return [one if value.HasField(spelled(name)) else ABSENT for value, one in pairs]
+    if hasattr(inner[0], "values"):  # a map is a list of entries
+        return [[{"key": k, "value": v} for k, v in one.items()] for one in inner]
+    return inner
 
 
-def _as_float(value: float) -> float:
+def is_list(value: Any) -> bool:
+    """Check whether a value has items."""
+    return hasattr(value, "__len__") and not isinstance(value, str | bytes | dict)
+
+
+# ROS
+
+_TIMES = "int32 sec\nuint32 nanosec\n"  # what definitions leave out
+_CONSTANT = re.compile(r"^[ \t]*[a-z]\w*(?:<=\d+)?[ \t]+\w+[ \t]*=(?!=).*$", re.MULTILINE)
+_OLD = re.compile(r"^([ \t]*)(?:byte|char)\b", re.MULTILINE)  # read as signed by rosbags
+_IDL_FILE = re.compile(r"^={3,}[^\S\n]*\nIDL:[^\n]*$", re.MULTILINE)
+_DIRECTIVE = re.compile(r"^[^\S\n]*#[^\n]*$", re.MULTILINE)
+_UNREAD = re.compile(
+    r'//[^\n]*|/\*.*?(?:\*/|\Z)|"(?:[^"\\\n]|\\.)*"', re.DOTALL
+)  # comments and texts
+# what rosbags would pass over without a word
+_NOT_PLAIN = re.compile(
+    r"@(?:optional|mutable)|\b(?:union|map|bitset|bitmask|any|interface|valuetype|long double)\b"
+    r"|\bstruct\s+\w+\s*:|(?:sequence\s*<\s*){2}|\]\s*\["
+)
+
+
+def _ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
+    """Return what decodes the messages of a ROS definition.
+
+    Raises:
+        BadSchema: if rosbags can't use it.
+    """
+    from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+
+    text = schema.data.decode("utf-8", "replace").replace("\r\n", "\n")
+    if schema.encoding not in ("ros1msg", "ros2msg", "ros2idl", "omgidl"):
+        raise BadSchema("decode", what="schema language", at=schema.encoding)
+    idl = schema.encoding.endswith("idl")
+    if idl and (refused := _NOT_PLAIN.search(_UNREAD.sub(" ", text))):
+        raise BadSchema("decode", what="definition", why="refused", at=refused[0][:40])
     try:
-        return float(value)
-    except OverflowError:  # an integer of hundreds of digits
-        return np.inf if value > 0 else -np.inf
+        kinds = (f"builtin_interfaces/msg/{kind}" for kind in ("Time", "Duration"))
+        types = {k: one for kind in kinds for k, one in get_types_from_msg(_TIMES, kind).items()}
+        if idl:
+            for part in _IDL_FILE.split(_DIRECTIVE.sub("", text)):
+                types |= get_types_from_idl(part) if part.strip() else {}
+        else:
+            text = _OLD.sub(r"\1uint8", _CONSTANT.sub("", text))
+            types |= get_types_from_msg(text, schema.name)
+        name = schema.name.replace("::", "/")
+        name = name if name in types else "/msg/".join(name.rsplit("/", 1))
+        plain = {kind: ([], fields) for kind, (_, fields) in types.items()}
+        if not all(map(_is_plain, plain, (fields for _, fields in plain.values()))):
+            raise BadSchema("decode", what="definition", why="refused", at="names")
+        store = get_typestore(Stores.EMPTY)
+        store.register(plain)
+        store.get_msgdef(name)
+    except (MemoryError, BadSchema):
+        raise
+    except Exception as error:  # a parser raises whatever a damaged definition leads to
+        raise BadSchema("decode", what="definition", why=_short(error)) from None
+    if encoding == "ros1":
+        return lambda data: store.deserialize_ros1(data, name)
+    return lambda data: store.deserialize_cdr(data, name)
+
+
+def _is_plain(kind: str, fields: Sequence[tuple[str, Any]]) -> bool:
+    """Check that names are identifiers: rosbags writes them into the code of a decoder."""
+    names = (*kind.split("/"), *(name for name, _ in fields))
+    return all(name.isidentifier() and name.isascii() for name in names)

@@ -1,119 +1,27 @@
-"""Protobuf messages as nodes, parsed one by one by Google's library, in C: a million in a second.
+"""Protobuf: messages of doubles as grounded writes them, and any others by Google's library.
 
-Its import takes longer than reading a trial. So messages of doubles that grounded writes, all of
-one form, are read by `uniform_doubles` without it.
+The import of that library takes longer than reading a trial, so messages of ours are encoded here,
+and read by `uniform_doubles` if all have one form. Ours hold doubles, numbered from 1. Zeros are
+written as well, so that all messages of a channel have the same length and -0.0 is preserved.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+import re
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from grounded_trials.formats.bad import BadMessage, BadSchema
-from grounded_trials.formats.mcap_records import windows
-from grounded_trials.formats.messages import (
-    Array,
-    Floats,
-    Ints,
-    Node,
-    ObjectNode,
-    Struct,
-    as_array,
-)
+from grounded.frozen import Array
+from grounded_trials.formats.bad import BadSchema
+from grounded_trials.formats.mcap_records import Schema, windows
 
-FIXED64, BYTES = 1, 2
-
-
-@dataclass(frozen=True)
-class _Entry:
-    """A key of a map, and its value."""
-
-    f1: Any
-    f2: Any
-
-    def HasField(self, name: str) -> bool:
-        """Return that both are there."""
-        return True
-
-
-class _ProtobufNode(ObjectNode):
-    """An absent field has its default, an absent message no row."""
-
-    def field(self, name: str) -> _ProtobufNode:
-        assert isinstance(self.type, Struct)
-        known, node = self.type.by_name[name], self
-        kind, name = known.type, f"f{known.number}"  # see `message_class`
-        if isinstance(kind, Struct):
-            node = self.keep(np.array([o.HasField(name) for o in self.objects], dtype=np.bool_))
-        inner = [getattr(o, name) for o in node.objects]
-        if isinstance(kind, Array) and isinstance(kind.item, Struct):  # a map is a list of entries
-            inner = [[*map(_Entry, o, o.values())] if hasattr(o, "values") else o for o in inner]
-        return node.among(kind, node.rows, inner)
-
-    def numbers(self) -> Floats:
-        return np.array(self.objects, dtype=np.float64)
-
-
-def protobuf_messages(buffer: bytes, type: Struct, start: Ints, end: Ints) -> Node:
-    """Return the root node of messages of one type at buffer[start[i]:end[i]].
-
-    Raises:
-        BadMessage: for a message that is not of this type.
-        BadSchema: if the library can't use its definition.
-    """
-    from google.protobuf.message import DecodeError
-
-    assert type.definition is not None
-    make, objects = message_class(type.definition, type.name), []
-    for i, (a, b) in enumerate(zip(start.tolist(), end.tolist(), strict=True)):
-        try:
-            objects.append(make.FromString(buffer[a:b]))
-        except DecodeError as error:
-            raise BadMessage(i, "decode", what="message", why=str(error)) from None
-    return _ProtobufNode(type, np.arange(len(objects)), as_array(objects))
-
-
-@lru_cache(maxsize=256)
-def message_class(definition: bytes, name: str) -> Any:
-    """Return the class of the messages `name` of a serialised FileDescriptorSet.
-
-    Its fields are called by their numbers, f1 ..., since the library takes ASCII names only.
-
-    Raises:
-        BadSchema: if the library can't use it.
-    """
-    from google.protobuf import descriptor_pool, message_factory
-    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
-    from google.protobuf.message import DecodeError
-
-    pool = descriptor_pool.DescriptorPool()
-
-    def add(file: FileDescriptorProto) -> None:  # after the files that it needs
-        for needed in [one for one in file.dependency if one in files]:
-            add(files.pop(needed))
-        _number(file.message_type)
-        pool.Add(file)
-
-    try:
-        files = {file.name: file for file in FileDescriptorSet.FromString(definition).file}
-        while files:
-            add(files.pop(next(iter(files))))
-        return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
-    except (DecodeError, TypeError, ValueError, KeyError, RecursionError) as error:
-        raise BadSchema("decode", what="definition", why="damaged", at=str(error)[:80]) from None
-
-
-def _number(messages: Iterable[Any]) -> None:
-    """Call the fields of message descriptions by their numbers, but for those of maps' entries."""
-    for message in messages:
-        for field in message.field if not message.options.map_entry else ():
-            field.name = f"f{field.number}"
-            field.ClearField("json_name")
-        _number(message.nested_type)
+VARINT, FIXED64, BYTES = 0, 1, 2  # what follows a tag
+DOUBLE, OPTIONAL, REPEATED = 1, 1, 3  # in google/protobuf/descriptor.proto
+NO_NUMBER = 9, 10, 11, 12  # there: texts and messages
 
 
 def varint(value: int) -> bytes:
@@ -136,12 +44,60 @@ def doubles_tag(number: int, count: int) -> bytes:
     return varint(number << 3 | BYTES) + varint(8 * count)
 
 
-def uniform_doubles(
-    buffer: bytes, start: Ints, end: Ints, fields: Sequence[tuple[bytes, int]]
-) -> list[Floats] | None:
-    """Decode messages that all have exactly these fields in this order.
+def file_descriptor_set(message: str, names: Sequence[str], *, repeated: bool = False) -> bytes:
+    """Return a serialised FileDescriptorSet of one proto3 message of doubles, numbered from 1."""
+    label = REPEATED if repeated else OPTIONAL
+    fields = [
+        _bytes(1, name.encode()) + _integer(3, number) + _integer(4, label) + _integer(5, DOUBLE)
+        for number, name in enumerate(names, start=1)
+    ]
+    definition = _bytes(1, message.encode()) + b"".join(_bytes(2, field) for field in fields)
+    name = f"grounded/{message}.proto".encode()
+    file = _bytes(1, name) + _bytes(2, b"grounded") + _bytes(4, definition) + _bytes(12, b"proto3")
+    return _bytes(1, file)
 
-    `mcap_writer` writes such messages.
+
+def _bytes(number: int, data: bytes) -> bytes:
+    return varint(number << 3 | BYTES) + varint(len(data)) + data
+
+
+def _integer(number: int, value: int) -> bytes:
+    return varint(number << 3 | VARINT) + varint(value)
+
+
+def encode_doubles(values: Array) -> list[bytes]:
+    """Return messages of doubles for rows of numbers (N, count)."""
+    tags = [double_tag(number) for number in range(1, values.shape[1] + 1)]
+    return _joined(list(zip(tags, values.T[:, :, None], strict=True)))
+
+
+def encode_lists(lists: Sequence[Array]) -> list[bytes]:
+    """Return messages of packed lists of doubles.
+
+    Args:
+        lists: one array (N, count) per field, with a row for each message; a field with count 0
+            is left out.
+    """
+    fields = enumerate(lists, start=1)
+    return _joined([(doubles_tag(n, v.shape[1]), v) for n, v in fields if v.shape[1]])
+
+
+def _joined(fields: Sequence[tuple[bytes, Array]]) -> list[bytes]:
+    """Return messages of fields, each a constant prefix followed by the row's doubles (N, ...)."""
+    parts = list[np.ndarray[Any, np.dtype[np.uint8]]]()
+    for prefix, values in fields:
+        data = np.ascontiguousarray(values, dtype="<f8").view(np.uint8)
+        parts += [np.tile(np.frombuffer(prefix, np.uint8), (len(values), 1)), data]
+    return [row.tobytes() for row in np.hstack(parts)]
+
+
+def uniform_doubles(
+    buffer: bytes,
+    start: NDArray[np.int64],
+    end: NDArray[np.int64],
+    fields: Sequence[tuple[bytes, int]],
+) -> list[Array] | None:
+    """Decode messages that all have exactly these fields in this order, as ours have.
 
     Args:
         buffer: the bytes.
@@ -163,3 +119,71 @@ def uniform_doubles(
     return [
         np.ascontiguousarray(part).view("<f8").astype(float, copy=False) for part in parts[1::2]
     ]
+
+
+_OWN_FIELD = re.compile(rb"\n[\x01-\x7f]([!-~]+)\x18.{1,2} ([\x01\x03])\(\x01", re.DOTALL)
+
+
+def numbers_in(schema: Schema) -> dict[str, tuple[int, bool]]:
+    """Return the keys of a message type's numbers, and whether they are lists, by their names.
+
+    A definition of ours is known without the library, verified by writing it again.
+
+    Raises:
+        BadSchema: if the definition can't be used.
+    """
+    own = _OWN_FIELD.findall(schema.data)
+    names, repeated = [name.decode() for name, _ in own], bool(own) and own[0][1] == b"\3"
+    written = file_descriptor_set(schema.name.removeprefix("grounded."), names, repeated=repeated)
+    if written == schema.data and schema.name.startswith("grounded."):
+        return {name: (i, repeated) for i, name in enumerate(names, start=1)}
+    from google.protobuf.descriptor_pb2 import DescriptorProto
+
+    described = DescriptorProto()
+    message_class(schema.data, schema.name).DESCRIPTOR.CopyToProto(described)
+    doubles = [one for one in described.field if one.type not in NO_NUMBER]
+    return {unspelled(one.name): (one.number, one.label == REPEATED) for one in doubles}
+
+
+@lru_cache(maxsize=256)
+def message_class(definition: bytes, name: str) -> Any:
+    """Return the class of the messages `name` of a serialised FileDescriptorSet.
+
+    Its fields have the names of `spelled`, since the library takes ASCII names only.
+
+    Raises:
+        BadSchema: if the library can't use it.
+    """
+    from google.protobuf import descriptor_pool, message_factory
+    from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
+    from google.protobuf.message import DecodeError
+
+    pool = descriptor_pool.DescriptorPool()
+
+    def add(file: FileDescriptorProto) -> None:  # after the files that it needs
+        for needed in [one for one in file.dependency if one in files]:
+            add(files.pop(needed))
+        for message in file.message_type:
+            for field in message.field:
+                field.name = spelled(field.name)
+        pool.Add(file)
+
+    try:
+        files = {file.name: file for file in FileDescriptorSet.FromString(definition).file}
+        while files:
+            add(files.pop(next(iter(files))))
+        return message_factory.GetMessageClass(pool.FindMessageTypeByName(name))
+    except (DecodeError, TypeError, ValueError, KeyError, RecursionError) as error:
+        why = " ".join(str(error).split())[:80]
+        raise BadSchema("decode", what="definition", why=why) from None
+
+
+def spelled(name: str) -> str:
+    """Return a field's name in ASCII."""
+    return name if name.isascii() else f"x_{name.encode().hex()}"
+
+
+def unspelled(name: str) -> str:
+    """Return the name that `spelled` wrote."""
+    coded = re.fullmatch(r"x_((?:[0-9a-f]{2})+)", name)
+    return bytes.fromhex(coded[1]).decode("utf-8", "replace") if coded else name

@@ -1,10 +1,10 @@
 """Tables of numbers as log records; those of `.npz` and PX4's `.ulg` are read here.
 
 Every reader of tables is a function (path, layout) -> {topic: {column: numbers}}; `text_tables` has
-that of `.csv`. `table_records` makes a topic of each table, whose messages hold a stamp and one
-double per column, so that tables are read like bags: `/csv.speed`, `/run03.q[1]`. Every table needs
-a column of times, which is stated in the name of its type ("csv, time in 't'"). Names keep letters,
-digits and underscores; a unit in brackets is left out.
+that of `.csv`. `table_records` makes a topic of each table, whose rows are its messages, so that
+tables are read like bags: `/csv.speed`, `/run03.q[1]`. Every table needs a column of times, which
+is stated in the name of its type ("csv, time in 't'"). Names keep letters, digits and underscores;
+a unit in brackets is left out.
 """
 
 from __future__ import annotations
@@ -21,11 +21,10 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import found
-from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
+from grounded_trials.formats.mcap_records import Channel, End, Header, Record, Rows, Schema
 from grounded_trials.formats.messages import Floats
 
 C = TypeVar("C")
-ROWS = 50_000  # rows in a batch
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps", "tout")
 CANDIDATE = {"candidate", "feedforward", "law"}  # names of arrays in an exported one
 TICKS = {  # an Arduino's functions, and their units in full
@@ -166,48 +165,14 @@ def table_records(
     if not tables:
         raise GroundedError(found("file.no_times", str(path)))
     yield Header("", kind)
-    packed = []
+    made = []
     for i, (topic, columns) in enumerate(tables.items()):
         name, stamps = _at(columns, rate) if rate else _times(columns, path)
-        fields = {k: column for k, column in columns.items() if k != name}
-        yield Schema(i + 1, f"{kind}, time in '{name}'", "ros2msg", _definition(list(fields)))
-        yield Channel(i, topic, "cdr", i + 1, {})
-        packed.append((i, stamps, fields))
-    for i, stamps, fields in packed:
-        for start in range(0, len(stamps), ROWS):
-            some = slice(start, start + ROWS)
-            yield _rows(i, stamps[some], [column[some] for column in fields.values()])
+        yield Schema(i + 1, f"{kind}, time in '{name}'", "", b"")
+        yield Channel(i, topic, "table", i + 1, {})
+        made.append(Rows(i, stamps, {k: column for k, column in columns.items() if k != name}))
+    yield from made
     yield End(data_crc=False)
-
-
-def _definition(fields: list[str]) -> bytes:
-    """Return the definition of a message with a header and doubles; `q[0]`, ... are an array."""
-    lines, seen = ["std_msgs/Header header"], dict[str, int]()
-    for field in fields:
-        name = field.partition("[")[0]
-        seen[name] = seen.get(name, 0) + 1
-    alone = set(fields)
-    for name, count in seen.items():
-        lines.append(f"float64 {name}" if name in alone else f"float64[{count}] {name}")
-    inner = "builtin_interfaces/Time stamp\nstring frame_id\n"
-    parts = {"std_msgs/Header": inner, "builtin_interfaces/Time": "int32 sec\nuint32 nanosec\n"}
-    text = "\n".join(lines) + "\n"
-    return (text + "".join(f"{'=' * 80}\nMSG: {k}\n{v}" for k, v in parts.items())).encode()
-
-
-def _rows(channel: int, stamps: Any, columns: list[Floats]) -> Messages:
-    kind = np.dtype([("cdr", "<u4"), ("sec", "<i4"), ("ns", "<u4"), ("id", "<u4"), ("end", "<u4")])
-    width, N = kind.itemsize + 8 * len(columns), len(stamps)
-    rows = np.zeros((N, width), np.uint8)
-    head = np.zeros(N, kind)
-    head["cdr"], head["id"] = 0x0100, 1  # little-endian; frame_id is empty
-    head["sec"], head["ns"] = np.divmod(stamps, 10**9)
-    rows[:, : kind.itemsize] = head.view(np.uint8).reshape(N, -1)
-    values = np.ascontiguousarray(np.array(columns, "<f8").reshape(len(columns), N).T)
-    rows[:, kind.itemsize :] = values.view(np.uint8).reshape(N, 8 * len(columns))
-    starts = np.arange(N, dtype=np.int64) * width
-    numbers = np.full(N, channel, np.uint16), np.arange(N, dtype=np.uint32)
-    return Messages(rows.tobytes(), starts, starts + width, *numbers, stamps, stamps)
 
 
 def _at(columns: Columns, rate: float) -> tuple[str, Any]:

@@ -20,7 +20,7 @@ from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
 from grounded.errors import GroundedError, alike, needs
 from grounded.findings import found
 from grounded_trials.formats import dataflash, parquet, text_tables
-from grounded_trials.formats.mcap_records import MAGIC, Messages, Metadata, Record, Schema
+from grounded_trials.formats.mcap_records import MAGIC, Channel, Messages, Metadata, Record, Rows
 from grounded_trials.formats.mcap_walk import mapped, read_records
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
@@ -363,10 +363,11 @@ def digest_of(log: Path) -> str:
 def _digest(files: tuple[Path, ...]) -> str:
     hasher = hashlib.sha256()
     for record in log_records(files[0]):
-        if isinstance(record, Schema):
-            hasher.update(record.data)
-        elif isinstance(record, Messages):
-            hasher.update(record.buffer)
+        if isinstance(record, Channel):
+            hasher.update(record.topic.encode())
+        elif isinstance(record, Rows):
+            for name, column in {"": record.times, **record.columns}.items():
+                hasher.update(name.encode() + column.tobytes())
     return hasher.hexdigest()
 
 

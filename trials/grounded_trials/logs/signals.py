@@ -7,8 +7,8 @@ times: when it was logged, when it was published, and its header's stamp.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -19,27 +19,15 @@ from grounded.checks import near, refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.formats.bad import Bad, BadMessage, BadPath, BadSchema
-from grounded_trials.formats.cdr import cdr_messages, ros1_messages
-from grounded_trials.formats.mcap_records import Channel, Messages, Schema
+from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema
 from grounded_trials.formats.message_path import MessagePath, parse_path
-from grounded_trials.formats.messages import (
-    Dynamic,
-    Floats,
-    Ints,
-    Node,
-    Struct,
-    Type,
-    json_messages,
-)
-from grounded_trials.formats.path_walk import Bound, Values, bind, evaluate
-from grounded_trials.formats.protobuf import message_class, protobuf_messages
-from grounded_trials.formats.schemas import struct_of
+from grounded_trials.formats.messages import Decoded, Decoder, Floats, Ints, decoder_of
+from grounded_trials.formats.path_walk import evaluate
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.log_files import log_records, read_apart
 
 Clock = Literal["header", "log", "publish"]
 TOPICS_NAMED = 8  # topics of a log that are all named where one is missing
-JSON_PIECE = 2**20  # [bytes] of JSON parsed at once, at least one message
 
 
 @dataclass(frozen=True)
@@ -72,7 +60,6 @@ class Series:
     log_times: Ints  # (N,) [ns]
     messages: int  # number of messages of its topic, with this number or not
     type: str  # of the topic's messages
-    stamped: bool  # the messages have a header stamp, used as the clock or not
 
     @cached_property
     def skew_s(self) -> float | None:
@@ -112,7 +99,7 @@ def _read_signals(
                 log.schemas[record.id] = record
             elif isinstance(record, Channel):
                 log.channel(record)
-            elif isinstance(record, Messages):
+            elif isinstance(record, Messages | Rows):
                 log.messages(record)
         for collector in collectors.values():
             collector.topics |= set(log.topics)
@@ -150,20 +137,19 @@ class _Log:
             return
         self.channels[channel.id] = channel
         schema = self.schemas.get(channel.schema_id)
-        self.topics[channel.topic] = schema.name if schema else channel.encoding
+        self.topics[channel.topic] = name = schema.name if schema else channel.encoding
         wanting = [c for c in self.collectors if c.path.topic == channel.topic]
         if wanting:
-            collector = wanting[0]
             try:
-                decoder = decoder_of(channel, schema)
-                for collector in wanting:
-                    collector.bind(decoder)
-            except (BadSchema, BadPath) as error:
-                raise self._misfit(channel, collector, error) from None
-            self.wanted[channel.id] = (decoder, wanting)
+                self.wanted[channel.id] = (decoder_of(channel, schema), wanting)
+            except BadSchema as error:
+                raise self._misfit(channel, wanting[0], error) from None
+        for collector in wanting:
+            collector.type = name
 
-    def messages(self, batch: Messages) -> None:
-        present = batch.channel_ids()
+    def messages(self, batch: Messages | Rows) -> None:
+        """Collect the samples in messages, or in the rows of a table."""
+        present = [batch.channel] if isinstance(batch, Rows) else batch.channel_ids()
         unknown = [c for c in present if c not in self.channels]
         if unknown:
             then = NextCommand("recover", (self.name,))
@@ -171,21 +157,22 @@ class _Log:
                 found("file.damaged", self.name, where=f"channel {unknown[0]}", then=then)
             )
         for identity, (decoder, wanting) in self.wanted.items():
-            if identity not in present:
-                continue
-            for part in decoder.parts(batch.of(identity)):
-                self._collect(decoder, wanting, part, self.channels[identity])
+            if identity in present:
+                own = batch if isinstance(batch, Rows) else batch.of(identity)
+                self._collect(decoder, wanting, own, self.channels[identity])
 
     def _collect(
-        self, decoder: Decoder, wanting: list[_Collector], own: Messages, channel: Channel
+        self, decoder: Decoder, wanting: list[_Collector], own: Messages | Rows, channel: Channel
     ) -> None:
-        collector = wanting[0]
+        collector, seen = wanting[0], 0
         try:
-            root = decoder.root(own.buffer, own.starts, own.ends)
-            for collector in wanting:
-                collector.collect(root, decoder, own)
+            for part in decoder.parts(own):
+                for collector in wanting:
+                    collector.collect(part)
+                seen += len(part.log_times)
         except BadMessage as error:
-            at = float(own.log_times[error.message]) * 1e-9
+            times = own.times if isinstance(own, Rows) else own.log_times
+            at = float(times[seen + error.message]) * 1e-9
             raise self._misfit(channel, collector, error, at) from None
         except BadPath as error:
             raise self._misfit(channel, collector, error) from None
@@ -203,93 +190,34 @@ class _Log:
         return GroundedError(found("file.signal", collector.name, **facts))
 
 
-@dataclass(frozen=True, eq=False)
-class Decoder:
-    """Decodes a channel's messages into the nodes that message paths are evaluated on."""
-
-    topic: str
-    name: str  # of the message type
-    type: Type
-    root: Callable[[bytes, Ints, Ints], Node] = field(repr=False)
-
-    def parts(self, batch: Messages) -> Iterator[Messages]:
-        """Split a batch into pieces to decode at once, since parsed messages take much memory."""
-        parsed = isinstance(self.type, Dynamic) or getattr(self.type, "definition", None)
-        if not parsed or not len(batch):
-            yield batch
-            return
-        piece = np.cumsum(batch.ends - batch.starts) // JSON_PIECE
-        for number in np.unique(piece):
-            yield batch.take(piece == number)
-
-
-_READERS: dict[str, Callable[[bytes, Struct, Ints, Ints], Node]] = {
-    "cdr": cdr_messages,
-    "ros1": ros1_messages,
-    "protobuf": protobuf_messages,
-}
-
-
-def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
-    """Return the decoder of a channel.
-
-    Raises:
-        BadSchema: if its encoding is not one of cdr, ros1, protobuf, json, or its schema is bad.
-    """
-    encoding, name = channel.encoding, schema.name if schema else ""
-    if encoding == "json":
-        return Decoder(channel.topic, name or "json", Dynamic(), json_messages)
-    if encoding not in _READERS:
-        raise BadSchema("decode", what="encoding", at=encoding)
-    if schema is None:
-        raise BadSchema("decode", what="schema", at=encoding)
-    type, read = struct_of(schema), _READERS[encoding]
-    if encoding == "protobuf":
-        message_class(schema.data, schema.name)
-    return Decoder(channel.topic, name, type, lambda b, s, e: read(b, type, s, e))
-
-
 class _Collector:
     """Gathers the samples of one signal."""
 
     def __init__(self, name: str, spec: SignalSpec) -> None:
         self.name, self.spec = name, spec
         self.path: MessagePath = parse_path(spec.path)
-        self.bound: dict[int, Bound] = {}
         self.parts: list[tuple[Ints, Floats, Ints]] = []
         self.messages = 0
-        self.type, self.stamped = "", False
+        self.type = ""
         self.topics: set[str] = set()
 
-    def bind(self, decoder: Decoder) -> None:
-        bound = bind(self.path, decoder.type)
-        self.bound[id(decoder)] = bound
-        self.type, self.stamped = decoder.name, bound.stamp is not None
-        dynamic = isinstance(decoder.type, Dynamic)
-        if self.spec.clock == "header" and not self.stamped and not dynamic:
-            raise BadPath("decode", what="header stamp")
-
-    def collect(self, root: Node, decoder: Decoder, batch: Messages) -> None:
-        self.messages += len(batch)
-        values = evaluate(root, self.bound[id(decoder)], self.spec.clock == "header")
+    def collect(self, part: Decoded) -> None:
+        self.messages += len(part.log_times)
+        by_header = self.spec.clock == "header"
+        values = evaluate(part, self.path, stamps=by_header)
         if len(values.rows) > 1 and (np.diff(values.rows) == 0).any():
             at = int(values.rows[np.argmax(np.diff(values.rows) == 0)])
-            raise BadPath("path", expected="one value", at=f"{batch.log_times[at] * 1e-9:.3f} s")
-        self.parts.append((self._times(batch, values), values.values, batch.log_times[values.rows]))
-
-    def _times(self, batch: Messages, values: Values) -> Ints:
-        if self.spec.clock == "log":
-            return batch.log_times[values.rows]
-        if self.spec.clock == "publish":
-            times = batch.publish_times[values.rows]
-            if (times < 0).any():
-                raise BadMessage(
-                    values.rows[np.argmax(times < 0)], "decode", what="stamp", at="2262"
-                )
-            return times
-        if values.stamps is None:
+            raise BadPath("path", expected="one value", at=f"{part.log_times[at] * 1e-9:.3f} s")
+        logged = part.log_times[values.rows]
+        if by_header and values.stamps is None and len(values.rows):
             raise BadPath("decode", what="header stamp")
-        return values.stamps
+        times = logged if values.stamps is None else values.stamps
+        if self.spec.clock == "publish":
+            times = part.publish_times[values.rows]
+            if (times < 0).any():
+                at = int(values.rows[np.argmax(times < 0)])
+                raise BadMessage(at, "decode", what="stamp", at="2262")
+        self.parts.append((times, values.values, logged))
 
     def series(self) -> Series:
         columns = [np.concatenate(part) for part in zip(*self.parts, strict=True)]
@@ -301,4 +229,4 @@ class _Collector:
             }
             raise GroundedError(found("file.signal", self.name, **facts))
         t, values, log_times = columns
-        return Series(self.spec, t, values, log_times, self.messages, self.type, self.stamped)
+        return Series(self.spec, t, values, log_times, self.messages, self.type)

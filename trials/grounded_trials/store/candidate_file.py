@@ -20,7 +20,8 @@ from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.onboard import WIDTH, fault
 from grounded.policy import Policy
-from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles, encode_lists
+from grounded_trials.formats.mcap_writer import McapWriter
+from grounded_trials.formats.protobuf import encode_doubles, encode_lists
 from grounded_trials.store.own_files import (
     CANDIDATE,
     Meta,

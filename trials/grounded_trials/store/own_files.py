@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
@@ -32,15 +31,8 @@ from grounded_trials.formats.mcap_records import (
     Schema,
 )
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
-from grounded_trials.formats.messages import Array as ArrayType
-from grounded_trials.formats.messages import Number, Struct
-from grounded_trials.formats.protobuf import (
-    double_tag,
-    doubles_tag,
-    protobuf_messages,
-    uniform_doubles,
-)
-from grounded_trials.formats.schemas import struct_of
+from grounded_trials.formats.messages import decoder_of, fields_of
+from grounded_trials.formats.protobuf import double_tag, doubles_tag, numbers_in, uniform_doubles
 from grounded_trials.plain_file import read_file, unreadable
 from grounded_trials.within import within
 
@@ -51,9 +43,7 @@ NAME_LIMIT = 1000  # number of states or of inputs
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
 RESERVED = ["format", "dt", "states", "inputs", "policy", "steps"]
 RESERVED += ["candidate", "start_inputs", "start_states", "start_ns", "sha256"]
-DOUBLES = ArrayType(Number("f8"))
 
-Counts = NDArray[np.integer[Any]]
 Meta = Mapping[str, str]
 Units = Mapping[str, str]
 
@@ -66,7 +56,7 @@ class OwnFile:
     data: bytes
     meta: dict[str, str]
     attachments: dict[str, bytes]
-    types: dict[str, Struct]
+    types: dict[str, tuple[Channel, Schema]]
     messages: dict[str, list[Messages]]
 
     @property
@@ -140,13 +130,17 @@ class OwnFile:
         """Return the numbers of some fields of a topic's messages, (N, size) each."""
         if topic not in self.types:
             raise unknown("channel", topic, self.types, self.name)
-        type, batches = self.types[topic], self.messages.get(topic, [])
+        batches = self.messages.get(topic, [])
+        try:
+            doubles = numbers_in(self.types[topic][1])
+        except BadSchema as error:
+            raise unreadable(f"{self.name}: {topic}", error) from None
+        there = {name: number for name, (number, many) in doubles.items() if many is listed}
         for name in sizes:
-            kind = type.by_name[name].type if name in type.by_name else None
-            if not (kind == DOUBLES if listed else isinstance(kind, Number)):
+            if name not in there:
                 what, where = "list" if listed else "number", f"{self.name}: {topic}"
-                raise unknown(what, name, type.by_name, where)
-        numbers = [(type.by_name[name].number, size) for name, size in sizes.items()]
+                raise unknown(what, name, there, where)
+        numbers = [(there[name], size) for name, size in sizes.items()]
         tags = [(doubles_tag(n, size) if listed else double_tag(n), size) for n, size in numbers]
         if not batches:
             return [np.zeros((0, size)) for size in sizes.values()]
@@ -158,21 +152,24 @@ class OwnFile:
                 found = [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
                 return found + [np.zeros((0, size)) for _, size in tags[len(some) :]]
         # laid out otherwise: it may take long
-        return within(self.name, len(self.data), self._fields, topic, type, batches, sizes)
+        return within(self.name, len(self.data), self._fields, topic, batches, sizes, listed)
 
     def _fields(
-        self, topic: str, type: Struct, batches: list[Messages], sizes: Mapping[str, int]
+        self, topic: str, batches: list[Messages], sizes: Mapping[str, int], listed: bool
     ) -> list[Array]:
+        try:
+            decoder = decoder_of(*self.types[topic])
+            objects = [o for b in batches for part in decoder.parts(b) for o in part.objects]
+        except BadMessage as error:
+            raise DamagedFile(self.name, 0, "record", f"{topic}", str(error)) from None
         found = []
         for name, size in sizes.items():
-            parts = [self._values(type, batch, name) for batch in batches]
-            counts = np.concatenate([count for _, count in parts])
-            if counts.any() and (counts != size).any():
-                k = int(np.argmax(counts != size))
-                raise wrong(
-                    f"{self.name}: {topic}[{k}].{name}", (int(counts[k]),), shape=f"({size},)"
-                )
-            found.append(np.concatenate([v for v, _ in parts]).reshape(-1, size))
+            values = fields_of(objects, name)
+            counts = [len(one) if listed else 1 for one in values]
+            if any(counts) and counts != [size] * len(counts):
+                k = next(k for k, count in enumerate(counts) if count != size)
+                raise wrong(f"{self.name}: {topic}[{k}].{name}", (counts[k],), shape=f"({size},)")
+            found.append(np.array(values if any(counts) else [], np.float64).reshape(-1, size))
         return found
 
     def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
@@ -191,21 +188,6 @@ class OwnFile:
         k = int(np.argmax(off))
         facts = {"sample": str(k), "at": times[k], "expected": k * dt, "dt": dt, "robot": 1}
         raise refused("file.grid", f"{self.name}: {topic}", **facts)
-
-    def _values(self, type: Struct, batch: Messages, name: str) -> tuple[Array, Counts]:
-        """Return a field's numbers in a batch of messages, and their count in each message."""
-        try:
-            root = protobuf_messages(batch.buffer, type, batch.starts, batch.ends)
-            found = root.field(name)
-            if isinstance(found.type, ArrayType):
-                found = found.items(0, -1)
-            return found.numbers(), np.bincount(found.rows, minlength=len(batch))
-        except BadSchema as error:
-            raise unreadable(self.name, error) from None
-        except BadMessage as error:
-            raise DamagedFile(
-                self.name, 0, "record", f"message {error.message}", str(error)
-            ) from None
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
@@ -261,14 +243,11 @@ def _sorted(
         yield channels[identity].topic, batch.of(identity)
 
 
-def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Struct:
+def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> tuple[Channel, Schema]:
     schema = schemas.get(channel.schema_id)
     if channel.encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise unreadable(f"{name}: {channel.topic}", channel.encoding)
-    try:
-        return struct_of(schema)
-    except BadSchema as error:
-        raise unreadable(f"{name}: {channel.topic}", error) from None
+    return channel, schema
 
 
 def stated(

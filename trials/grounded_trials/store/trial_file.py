@@ -18,7 +18,8 @@ import numpy as np
 from grounded.checks import of_shape, refused, wrong
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles
+from grounded_trials.formats.mcap_writer import McapWriter
+from grounded_trials.formats.protobuf import encode_doubles
 from grounded_trials.plain_file import unwritable
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
 from grounded_trials.store.store import write_atomically

@@ -85,7 +85,7 @@ def start_in(policy, felt, sent):
 
     def logged(values, late=0):
         t = late + 10_000_000 * np.arange(len(values))
-        return Series(SignalSpec("/a.b"), t, values, t, len(t), "", True)
+        return Series(SignalSpec("/a.b"), t, values, t, len(t), "")
 
     series = {"x": logged(felt[:, 0]), "v": logged(felt[:, 1]), "force": logged(sent, 1_000_000)}
     names = {"state_names": policy.state_names, "input_names": policy.input_names}

@@ -18,7 +18,7 @@ TABLE = EstimateTable({"x": 0.002}, {})
 
 def series(t, values, path="/csv.x"):
     stamps = np.round(1e9 * (1000 + t)).astype(np.int64)
-    return Series(SignalSpec(path, "log"), stamps, values, stamps, len(t), "table", False)
+    return Series(SignalSpec(path, "log"), stamps, values, stamps, len(t), "table")
 
 
 def driven(every=0.01, until=6.0, size=1.0, noise=0.002, seed=0):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from grounded_trials import Workspace
-from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles
+from grounded_trials.formats.mcap_writer import McapWriter
+from grounded_trials.formats.protobuf import encode_doubles
 from workspaces import CONFIG, make
 
 

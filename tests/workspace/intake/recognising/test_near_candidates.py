@@ -12,7 +12,8 @@ from facts import of_code
 from grounded.accounts.returned import suspicion
 from grounded.accounts.sent import evidence, follows
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_writer import McapWriter, encode_doubles
+from grounded_trials.formats.mcap_writer import McapWriter
+from grounded_trials.formats.protobuf import encode_doubles
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate

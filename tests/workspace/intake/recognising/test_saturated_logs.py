@@ -70,7 +70,7 @@ def log_of(rows):
 
     def logged(values, late):
         t = np.round(1e9 * (1000 + rows[:, 0] + late)).astype(np.int64)
-        return Series(SignalSpec("/a.b"), t, values, t, len(t), "", True)
+        return Series(SignalSpec("/a.b"), t, values, t, len(t), "")
 
     series = {
         "tilt": logged(rows[:, 1], 0.0),

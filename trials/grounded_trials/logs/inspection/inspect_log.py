@@ -9,6 +9,7 @@ two must not be mixed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import combinations
@@ -19,26 +20,29 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded_trials.formats.bad import Bad, BadPath
-from grounded_trials.formats.mcap_records import Channel, Header, Messages, Metadata, Schema
+from grounded_trials.formats.mcap_records import (
+    Channel,
+    Header,
+    Messages,
+    Metadata,
+    Rows,
+    Schema,
+)
 from grounded_trials.formats.mcap_walk import DamagedFile
-from grounded_trials.formats.message_path import WORLD, is_topic, parse_path
+from grounded_trials.formats.message_path import WORLD, MessagePath, is_topic, parse_path
 from grounded_trials.formats.messages import (
-    Dynamic,
+    Decoded,
+    Decoder,
     Floats,
     Ints,
-    Struct,
+    decoder_of,
+    fields_of,
+    names_in,
 )
-from grounded_trials.formats.path_walk import (
-    FIELD_LIMIT,
-    Bound,
-    bind,
-    evaluate,
-    number_paths,
-)
+from grounded_trials.formats.path_walk import FIELD_LIMIT, evaluate, number_paths
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_records, read_apart
-from grounded_trials.logs.signals import Decoder, decoder_of
 
 NAMING = {  # types of messages that name joints, and their field
     "/JointState": "name",
@@ -224,6 +228,8 @@ class _Look:
             self.channels[record.id] = known
         elif isinstance(record, Metadata) and record.name == "grounded":
             self.meta = record.data
+        elif isinstance(record, Rows):
+            self.channels[record.channel].add(record)
         elif isinstance(record, Messages):
             for identity in record.channel_ids():
                 if identity in self.channels:
@@ -264,7 +270,7 @@ class _Look:
 class _Range:
     """The values of one path so far."""
 
-    bound: Bound
+    path: MessagePath
     low: float = np.inf
     high: float = -np.inf
     count: int = 0
@@ -302,50 +308,46 @@ class _Topic:
     ranges: dict[str, _Range] = field(default_factory=dict)
     joints: set[tuple[str, ...]] = field(default_factory=set)
 
-    def add(self, batch: Messages) -> None:
-        self.count += len(batch)
-        self.log_times.append(batch.log_times)
-        if self.problem or not len(batch):
+    def add(self, batch: Messages | Rows) -> None:
+        """Take messages, or the rows of a table, into account."""
+        times = batch.times if isinstance(batch, Rows) else batch.log_times
+        self.count += len(times)
+        self.log_times.append(times)
+        if self.problem or not len(times):
             return
-        stride = 1 + self.looked // DECODED
-        chosen = np.zeros(len(batch), dtype=np.bool_)
-        chosen[::stride] = True
-        self.looked += int(chosen.sum())
+        if isinstance(batch, Messages):
+            chosen = np.zeros(len(times), dtype=np.bool_)
+            chosen[:: 1 + self.looked // DECODED] = True
+            self.looked += int(chosen.sum())
+            batch = batch.take(chosen)
         try:
             if self.decoder is None:
                 self.decoder = decoder_of(self.channel, self.schema)
-                self._find_paths(batch)
-            self.joints |= _joints_in(batch, self.decoder)
-            for part in self.decoder.parts(batch.take(chosen)):
+            for part in self.decoder.parts(batch):
                 self._look(self.decoder, part)
         except Bad as error:
             self.problem = str(error)
 
-    def _look(self, decoder: Decoder, batch: Messages) -> None:
-        root = decoder.root(batch.buffer, batch.starts, batch.ends)
+    def _look(self, decoder: Decoder, part: Decoded) -> None:
+        if not self.ranges:
+            self._find_paths(part)
+        self.joints |= _joints_in(part, decoder)
         for i, one in enumerate(self.ranges.values()):
             try:
-                values = evaluate(root, one.bound, stamps=i == 0)
-            except BadPath:  # behind a wstring, or a text in one JSON message
+                values = evaluate(part, one.path, stamps=i == 0)
+            except BadPath:  # of another kind in another JSON message
                 continue
-            one.add(values.values, batch.log_times[values.rows])
-            if values.stamps is not None:
-                self.skews.append(values.stamps - batch.log_times[values.rows])
+            one.add(values.values, part.log_times[values.rows])
+            if values.stamps is not None and len(values.stamps):
+                self.skews.append(values.stamps - part.log_times[values.rows])
 
-    def _find_paths(self, batch: Messages) -> None:
-        assert self.decoder is not None
-        sample = None
-        if isinstance(self.decoder.type, Dynamic):
-            sample = self.decoder.root(batch.buffer, batch.starts[:1], batch.ends[:1]).sample()
+    def _find_paths(self, part: Decoded) -> None:
         topic = self.channel.topic if is_topic(self.channel.topic) else f'"{self.channel.topic}"'
-        for rest in number_paths(self.decoder.type, sample):
-            try:
+        for rest in dict.fromkeys(rest for one in part.samples for rest in number_paths(one)):
+            with suppress(GroundedError):  # a name that no path can contain
                 path = parse_path(topic + rest)
-                found = _Range(bind(path, self.decoder.type))
-                found.samples = [] if measured_kind(path.text) else None
-                self.ranges[path.text] = found
-            except (BadPath, GroundedError):
-                continue
+                self.ranges[path.text] = one = _Range(path)
+                one.samples = [] if measured_kind(path.text) else None
 
     def report(self, start: int) -> TopicReport:
         t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)
@@ -353,7 +355,6 @@ class _Topic:
         low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
         median = float(np.median(gaps)) if len(gaps) else 0.0
         skews = np.concatenate(self.skews) if self.skews else None
-        stamped = any(found.bound.stamp is not None for found in self.ranges.values())
         return TopicReport(
             topic=self.channel.topic,
             type=self.schema.name if self.schema else "",
@@ -364,22 +365,18 @@ class _Topic:
             largest_gap_s=float(gaps.max(initial=0.0)),
             first_s=float(t.min() - start) * 1e-9 if len(t) else None,
             last_s=float(t.max() - start) * 1e-9 if len(t) else None,
-            stamped=stamped or bool(skews is not None and len(skews)),
-            skew_s=float(np.median(skews)) * 1e-9 if skews is not None and len(skews) else None,
+            stamped=skews is not None,
+            skew_s=None if skews is None else float(np.median(skews)) * 1e-9,
             fields=tuple(_field(p, r) for p, r in _telling(self.ranges).items() if r.count),
             problem=self.problem,
         )
 
 
-def _joints_in(batch: Messages, decoder: Decoder) -> set[tuple[str, ...]]:
-    """Return the lists of joints' names in the first and last message of a batch."""
-    kind = decoder.type
+def _joints_in(part: Decoded, decoder: Decoder) -> set[tuple[str, ...]]:
+    """Return the lists of joints' names in the first and last of some messages."""
     listed = next((field for name, field in NAMING.items() if decoder.name.endswith(name)), "")
-    if not isinstance(kind, Struct) or listed not in kind.by_name:
-        return set()
-    ends = [slice(0, 1), slice(len(batch) - 1, len(batch))]
-    roots = (decoder.root(batch.buffer, batch.starts[one], batch.ends[one]) for one in ends)
-    return {tuple(root.field(listed).items(0, -1).texts()) for root in roots}
+    some = [one for one in part.samples if listed in names_in(one)]
+    return {tuple(map(str, names)) for names in fields_of(some, listed)}
 
 
 def _telling(ranges: Mapping[str, _Range]) -> dict[str, _Range]:
