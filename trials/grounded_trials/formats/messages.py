@@ -190,7 +190,7 @@ def _ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
             types |= get_types_from_msg(text, schema.name)
         name = schema.name.replace("::", "/")
         name = name if name in types else "/msg/".join(name.rsplit("/", 1))
-        plain = {kind: ([], fields) for kind, (_, fields) in types.items()}
+        plain: dict[str, Any] = {kind: ([], fields) for kind, (_, fields) in types.items()}
         if not all(map(_is_plain, plain, (fields for _, fields in plain.values()))):
             raise BadSchema("decode", what="definition", why="refused", at="names")
         store = get_typestore(Stores.EMPTY)
