@@ -46,41 +46,8 @@ SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or
 OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
 
 
-@dataclass(frozen=True)
-class Early:
-    """By how much the states of a trial respond too early, and the evidence.
-
-    Args:
-        seconds: the shift, to about one step.
-        state: the state whose prediction improves most with the later commands.
-        logged: its rms error a quarter of a second ahead with the log as it is, in its unit.
-        mended: the same with the later commands.
-        gain: by how much the later commands reduce all errors [nats].
-    """
-
-    seconds: float
-    state: int
-    logged: float
-    mended: float
-    gain: float
-
-    def finding(self, model: Model, shown: Sequence[int]) -> Finding:
-        """Return that the clocks of commands and of the states `shown` differ."""
-        name = model.state_names[self.state]
-        return found(
-            "log.clock",
-            *names_of(model, shown),
-            state=name,
-            lead=self.seconds,
-            tables=tables(model, names_of(model, shown)),
-            logged=Quantity(self.logged, model.states[name]),
-            mended=Quantity(self.mended, model.states[name]),
-            nats=self.gain,
-        )
-
-
 def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
-    """Raise an error if states respond to commands before they are sent.
+    """Raise an error if states respond to commands before they are sent, in half of the trials.
 
     Args:
         model: however crude.
@@ -90,15 +57,13 @@ def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
     Raises:
         UnusableTrials: naming the state, the seconds and the correction.
     """
-    each = {k: answers_early(model, one, shown) for k, one in enumerate(trials)}
-    few = 2 * sum(early is not None for early in each.values()) < len(each)  # a swing that sticks
-    some = {k: e for k, e in each.items() if e and (not few or e.gain > 2 * MARGIN)}
-    if some:
-        early, known = next(iter(some.values())), known_states(trials[min(some)], shown)
-        raise UnusableTrials(trials, list(some), early.finding(model, known))
+    each = {k: clocks_apart(model, one, shown) for k, one in enumerate(trials)}
+    some = {k: told for k, told in each.items() if told}
+    if some and 2 * len(some) >= len(each):  # one of many is a swing that sticks
+        raise UnusableTrials(trials, list(some), next(iter(some.values())))
 
 
-def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | None:
+def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | None:
     """Return by how much the states of a trial lead its commands; None if they do not.
 
     Args:
@@ -138,20 +103,22 @@ def answers_early(model: Model, trial: Trial, shown: Sequence[int]) -> Early | N
         near = range(max(least, about - every + 1), min(reach, about + every - 1) + 1)
         fits = {k: as_told(later(k)) for k in near}
         k = min(fits, key=lambda k: fits[k].score)
-        if fits[k].score > logged.still().score - MARGIN:
-            return None  # the commands explain nothing
         # all that past and present commands can do
         before = min(
             logged.best([ones, 0.0 * ones]),
             logged.whatever_commands_do().best([ones]),
             key=lambda fit: fit.score,
         )
-    parts = fits[k].rms / before.rms
-    if before.score - fits[k].score < MARGIN or parts.min() > HALF_ERROR:
+    parts, gain = fits[k].rms / before.rms, before.score - fits[k].score
+    if gain < MARGIN or parts.min() > HALF_ERROR:
         return None
-    state = min(seen, key=lambda i: float(parts[i]))
-    errors = float(before.rms[state]), float(fits[k].rms[state])
-    return Early(k * trial.dt, state, *errors, gain=before.score - fits[k].score)
+    names, state = names_of(model, seen), min(seen, key=lambda i: float(parts[i]))
+    name = model.state_names[state]
+    logged_s, mended_s = (
+        Quantity(float(fit.rms[state]), model.states[name]) for fit in (before, fits[k])
+    )
+    told = found("log.clock", *names, state=name, lead=k * trial.dt, nats=gain)
+    return told.also(tables=tables(model, names), logged=logged_s, mended=mended_s)
 
 
 def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Trial, list[int]]:
@@ -197,7 +164,7 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
         return (UNKNOWN,) * model.m
     found = list[tuple[Array, Array]]()
     with np.errstate(all="ignore"):
-        for seconds in (HORIZONS[0], HORIZONS[-1]):
+        for seconds in HORIZONS[::2]:
             ahead = Ahead(model, known, some, STARTS, DELAYS, linear=True, horizon=seconds)
             if ahead.enough:
                 found.append(_scores(ahead))
@@ -253,21 +220,22 @@ def _left(ahead: Ahead, own: Array, j: int, share: float | None) -> tuple[float,
 
 
 def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
-    """Return how an input acts, if predictions of all lengths agree on it."""
+    """Return how an input acts, if predictions of both lengths agree on it.
+
+    Over one of them its way must lead, over the other do better than its reverse: resistance that
+    the model lacks leaves less of an input the longer it acts.
+    """
     known = [(nats, share) for nats, share in each if np.isfinite(nats).all()]
-    if not known:
+    if len(known) < len(HORIZONS[::2]):
         return UNKNOWN
-    # over the shortest length that tells it must lead, over the others do better than its reverse:
-    # resistance that the model lacks leaves less of an input the longer it acts
     leads = [
         float(np.delete(nats, k).min() - nats[k]) for nats, _ in known for k in [nats.argmin()]
     ]
     nats, share = known[next((k for k, lead in enumerate(leads) if lead > HINT), 0)]
     way = int(nats.argmin())
-    agree = [float(one[2 - way] - one[way]) for one, _ in known]
-    reversal = way == 2 and (len(known) < 2 or min(agree) < HINT)
+    agree = min(float(one[2 - way] - one[way]) for one, _ in known)
     sized = SHARES[0] < (1 - way) * share < SHARES[1]
-    clear = way != 1 and max(leads) > HINT and min(agree) > 0 and not reversal
+    clear = way != 1 and max(leads) > HINT and agree > HINT * (way == 2)
     return Acts(1 - way if clear and sized else 0, float(share))
 
 

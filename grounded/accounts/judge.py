@@ -88,9 +88,7 @@ def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:
     return [told.account.mended(t) if k in told.trials else t for k, t in enumerate(trials)]
 
 
-def contradicted(
-    model: Model, trial: Trial, shown: Sequence[int], account: Account, *, constant: bool = True
-) -> bool:
+def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Account) -> bool:
     """Check whether the model predicts a trial clearly better as logged than without a fault.
 
     Args:
@@ -98,18 +96,9 @@ def contradicted(
         trial: of its states and inputs.
         shown: indices of the states with a sensor.
         account: the fault, of another trial.
-        constant: remove a constant rate of each state, which a command at its limit may make.
     """
-    known, ones = known_states(trial, shown), np.ones(model.m)
-    seconds = horizon_of(trial, known)
-    logged, mended = (
-        Ahead(model, one, known, 2 * STARTS, constant=constant, horizon=seconds)
-        for one in (trial, account.mended(trial))
-    )
-    if not (logged.enough and mended.enough):
-        return False
-    with np.errstate(all="ignore"):
-        return mended.plain(ones).missed - logged.plain(ones).missed > HINT
+    seen = _Seen(model, trial, (), shown, [account])
+    return seen.gains.get(account, 0.0) < -HINT
 
 
 # --- by rows --------------------------------------------------------------------------------------

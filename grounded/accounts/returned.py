@@ -19,7 +19,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from grounded.accounts.judge import contradicted
 from grounded.accounts.motion import MARGIN
 from grounded.accounts.reported import tables
 from grounded.accounts.sent import (
@@ -35,7 +34,6 @@ from grounded.accounts.sent import (
     apart,
     commanded,
     evidence,
-    far,
     follows,
     latest,
     states_ago,
@@ -56,11 +54,10 @@ ROWS_IN_FULL = 12  # rows that are compared in full
 OTHERS = 20  # number of latest candidates to compare with
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
 NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
-TIMES = {"ms": 1e3, "us": 1e6, "minutes": 1 / 60}  # units of a time that should be in seconds
+TIMES = {"ms": 1e3, "a clock": np.inf, "no unit: it stays 0": 0.0}  # in place of seconds
 AGES = (0.0, 1.0, 2.0)  # [steps] of the states acted on that rows are first compared with
 SHARES = np.arange(1, 49) / 50  # of its last value that a first-order filter keeps
 COARSE = 100  # steps of a run at which a log may begin, first tried
-GROSS = 10.0  # smallest factor, or its inverse, that the prediction alone tells
 
 
 class Kind(Enum):
@@ -174,7 +171,6 @@ def stories(
     trial: Trial,
     plain: Following | None,
     *,
-    acts: bool = False,
     logged: Sequence[str] | None = None,
     waits: bool | None = None,
 ) -> list[Story]:
@@ -185,7 +181,6 @@ def stories(
         own: the candidate.
         trial: the trial, which is said to be its run.
         plain: the comparison of its commands with the policy's.
-        acts: whether other commands than those held before a run are sent elsewhere in its log.
         logged: the states that a column holds; None: all.
         waits: whether its log begins before any run; None if that is unknown.
 
@@ -196,10 +191,8 @@ def stories(
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
-    rows = nearest(rows_of(task, own, trial, acts=acts, logged=logged, waits=waits))
+    rows = nearest(rows_of(task, own, trial, logged, waits))
     some = [one for row in rows for one in stories_of(row, task, own, trial, plain)]
-    if not some and not plain.beyond:
-        some += _by_motion(task.model, own, trial, plain, logged)
     return sorted(some, key=lambda one: one.left)
 
 
@@ -254,35 +247,6 @@ def _tells(plain: Following, fit: Following) -> bool:
     return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
 
 
-def _by_motion(
-    model: Model, own: Ran, trial: Trial, plain: Following, logged: Sequence[str]
-) -> Iterator[Story]:
-    """Yield the states in another unit or of the other sign that commands don't tell, at most one.
-
-    A policy that hardly uses a speed sends the same commands whatever its unit. The run must be
-    near its prediction in most other states, and with the column put right in this one, too. A real
-    motion may be opposite to a small predicted one: a sign must also be wrong by the model.
-    """
-    as_it_is, before, best = far(own, trial), apart(own, trial), list[Story]()
-    known, every = np.isfinite(as_it_is), (*model.state_names, *model.input_names)
-    for account in of_commands(model) if plain.alike else ():
-        names, by = tuple(every[k] for k in account.columns), 1 / account.factor
-        which = [i for i in account.columns if i < model.n and known[i]]
-        rest = [i for i in np.flatnonzero(known) if i not in which]
-        gross = by == -1 or not 1 / GROSS < abs(by) < GROSS
-        if not which or not rest or not gross or not {*names} <= {*logged}:
-            continue
-        run = multiplied(trial, names, by)
-        nearer = before - apart(own, run) > 2 * MARGIN and far(own, run)[which].max() < 1
-        if not nearer or np.median(as_it_is[rest]) > MARGIN:
-            continue
-        fault = Account("sign", tuple(which), -1.0)
-        if by == -1 and not contradicted(model, run, range(model.n), fault):
-            continue
-        best.append(scored(Kind.UNIT, None, own, run, _left(plain), names=names, by=by))
-    yield from sorted(best, key=lambda one: one.left)[:1]
-
-
 def nearest(rows: Sequence[Row]) -> list[Row]:
     """Return the rows that explain the commands best, each policy's compared at once."""
     score, groups = dict[int, float](), dict[int, list[int]]()
@@ -314,8 +278,6 @@ def rows_of(
     task: Task,
     own: Ran,
     trial: Trial,
-    *,
-    acts: bool,
     logged: Sequence[str],
     waits: bool | None,
 ) -> list[Row]:
@@ -325,13 +287,12 @@ def rows_of(
         task: the task of the candidate.
         own: the candidate.
         trial: the trial, not longer than its run.
-        acts: whether other commands than those held before a run are sent elsewhere in its log.
         logged: the states that a column holds.
         waits: whether its log begins before any run; None if that is unknown.
     """
-    scales, fed = [*_scales(task, own, trial, logged)], own.policy.gain is not None
+    scales, fed = [*_scales(task.model, own, trial, logged)], own.policy.gain is not None
     some = [*scales, *_orders(task.model, own, trial, logged)]
-    some += _times(own, trial, acts=acts)
+    some += _times(own, trial)
     if fed:
         some += _fitted(task.model, own, trial, scales, logged)
         some += _smoothed(task.model, own, trial)
@@ -347,14 +308,14 @@ def _passed(
     return Story(Kind.PROGRAM, told, price=price, names=tuple(names), by=facts.get("times", 1.0))
 
 
-def _scales(task: Task, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
+def _scales(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
     """Yield columns in another unit or of the other sign: of the log, or as a program passed them.
 
     At the limits one state may explain as much as all, but a program passes all in one unit.
     """
-    model, fed, inputs = task.model, own.policy.gain is not None, trial.inputs
+    fed = own.policy.gain is not None
     names, guessed = (*model.state_names, *model.input_names), {*model.state_names} - {*logged}
-    for one in (*full_scales(task, inputs), *of_commands(model, inputs)):
+    for one in of_commands(model, trial.inputs):
         group, by = tuple(names[k] for k in one.columns), 1 / one.factor
         some = [Story(Kind.UNIT, price=one.price, names=group, by=by)] * bool({*group} - guessed)
         if max(one.columns) < model.n and fed:
@@ -368,36 +329,10 @@ def _scales(task: Task, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterat
             yield Row(own.policy, one.mended(trial), tuple(some))
 
 
-def full_scales(task: Task, inputs: Array) -> Iterator[Account]:
-    """Yield that inputs beyond their limits are in percent or thousandths of the larger one.
-
-    Args:
-        task: with the limits.
-        inputs: the commands (T, m) of a log.
-    """
-    for j, unit in enumerate(task.model.inputs.values()):
-        full = float(max(abs(task.low[j]), abs(task.high[j])))
-        most = np.nanmax(np.abs(inputs[:, j]), initial=0.0)
-        if np.isfinite(full) and most > full and not (full == 1 and unit == "1"):
-            for parts in (1e2, 1e3):
-                yield Account("unit", (task.model.n + j,), parts / full)
-
-
 def unit_by_factor(model: Model, names: Sequence[str], by: float) -> str:
     """Return the unit of signals in a log that a factor converts to the model's; "" if unknown."""
     own = {**model.states, **model.inputs}
     return unit_named((own[name] for name in names), 1 / by) if names else ""
-
-
-def of_full_scale(task: Task, names: Sequence[str], by: float) -> str:
-    """Return `percent of 10 N` if a factor converts an input from that; "" otherwise."""
-    if len(names) != 1 or names[0] not in task.model.inputs:
-        return ""
-    j = task.model.input_names.index(names[0])
-    full = float(max(abs(task.low[j]), abs(task.high[j])))
-    parts = {"percent": 1e-2, "thousandths": 1e-3}
-    part = next((name for name, one in parts.items() if np.isclose(by, full * one)), "")
-    return part and f"{part} of {with_unit(f'{full:g}', task.model.inputs[names[0]])}"
 
 
 def _orders(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
@@ -440,19 +375,12 @@ def _misordered(model: Model, own: Ran, order: Sequence[int]) -> Story:
     return _passed("run.passed", own, price, moved, passed=passed, order=right)
 
 
-def _times(own: Ran, trial: Trial, *, acts: bool) -> Iterator[Row]:
-    """Yield the policy at other times than the run's, and without its feedback.
-
-    Args:
-        own: the candidate.
-        trial: its run.
-        acts: whether other commands than those held before a run are sent elsewhere in its log.
-    """
-    policy = own.policy
-    held = np.abs(trial.inputs - policy.past).max(axis=1) <= 1e-9  # none was sent
-    times = {unit: f for unit, f in TIMES.items() if f < 1 or not held[0]}
-    times |= {} if acts or not held.all() else {"a clock": np.inf}
-    for unit, factor in (times | {"no unit: it stays 0": 0.0}).items():
+def _times(own: Ran, trial: Trial) -> Iterator[Row]:
+    """Yield the policy at other times than the run's, and without its feedback."""
+    policy, times = own.policy, TIMES
+    if not np.abs(trial.inputs - policy.past).max() <= 1e-9:  # some were sent
+        times = {unit: factor for unit, factor in times.items() if np.isfinite(factor)}
+    for unit, factor in times.items():
         story = _passed("run.passed", own, time=unit)
         yield Row(_at_times(policy, factor), trial, (story,))
     if policy.gain is not None:

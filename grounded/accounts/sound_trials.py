@@ -23,7 +23,7 @@ from grounded.accounts.judge import Verdict, judge
 from grounded.accounts.kinematics import Gap, gaps
 from grounded.accounts.motion import HALF_ERROR
 from grounded.accounts.reported import keys, names_of, reported
-from grounded.accounts.signals import judge_inputs, judge_signal, signal_of
+from grounded.accounts.signals import judge_signal, signal_of
 from grounded.accounts.table import Told
 from grounded.accounts.time_step import judge_resolution, judge_time_step
 from grounded.findings import Quantity
@@ -81,7 +81,6 @@ def sound_trials(
         ages = Ages(model, used, shown)
         found += ages.findings(one_message)
         found += _unexplained(model, ages.trials, verdict, shown)
-        found += [*judge_inputs(subject, ages.trials)]
         found += judge_time_step(model, ages.trials, ages.shown)
         found = _by_the_clock(found, ages)
     judge_clocks(model, ages.trials, shown)
@@ -98,7 +97,7 @@ def _samples(
     """Check the samples of each sensor on its own; return the findings and the mended trials."""
     found, mended = list[Finding](), list(trials)
     for i in shown:
-        signal = signal_of(model, mended, i, shown)
+        signal = signal_of(model, mended, i)
         findings, after = judge_signal(signal)
         found += findings
         if after is not signal:

@@ -120,8 +120,7 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "{about} goes [[from {logged}]][[up to {most}]] beyond its [limits][[, {limits}]] in this "
         "log",
-        "[[most? log the commands after clipping]][[{how:percent=if it is in percent multiply its "
-        "scale in [log] by 0.01,flip=its scale in "
+        "[[most? log the commands after clipping]][[{how:flip=its scale in "
         "[log] is negative: multiply these limits by -1 too,widen=no plan will use that: widen "
         "them if the robot can take it}]]",
     ),
@@ -184,7 +183,6 @@ ENTRIES: dict[str, Entry] = {
         "[[{log} did not run {ran}: ]]its commands are not what {ran} sends on the logged states: "
         "{about} differs by {rms} (rms)[[; it is {logged}, beyond its [limits] {limits}]][[; alike "
         "up to {until}]][[; only {lasts} of commands]][[; {guessed} by [estimate] may be why]]"
-        "[[ (no copy of {bare} in it)]]",
         "who drove? Use --data, --candidate {ran} anyway, or set [log.span] start",
         hides=("log.start_doubt", "log.start_loose", "run.start", "run.reversed"),
     ),
@@ -209,17 +207,10 @@ ENTRIES: dict[str, Entry] = {
         ": its utility can't be compared",
         "ingest it with --data for fit and diagnose[[was? ; or change the task back]]",
     ),
-    "bare": Entry(
-        "warn",
-        OF + "its commands are like those of {ran}, but not the same, and it holds no copy of it",
-        "if another workspace's {ran} ran, `discard` it; to be sure, write trials with "
-        "TrialWriter(..., policy=Path(candidate).read_bytes())",
-    ),
     "late": Entry(
         "warn",
-        "its commands are those of {ran} {steps:step} {side}: {what:log=the robot moved by them "
-        "before they were logged,either=its program sent them late or the log has them late,"
-        "start=shifted by that they fit better}",
+        "its commands are those of {ran} {steps:step} {side}: {what:either=its program sent them "
+        "late or the log has them late,start=shifted by that they fit better}",
         "log each command when it is sent; if it is, [log.span] start is {steps:step} too "
         "{side:late=early,early=late}",
     ),

@@ -93,13 +93,6 @@ ENTRIES: dict[str, Entry] = {
         "dt to what the robot can",
         hides=OUTCOME,
     ),
-    "late": Entry(
-        "aside",
-        "its program sent the commands of {ran} {steps:step} late: the robot moved with them as "
-        "they are in the log, as in {others}",
-        CALL,
-        hides=OUTCOME,
-    ),
     # the robot
     "reversed": Entry(
         "aside",

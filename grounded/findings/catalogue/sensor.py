@@ -21,25 +21,12 @@ ENTRIES: dict[str, Entry] = {
         "shows [[{share:%} of]][[{size} {way} than]] the rate of {of}[[rpm? , 2 pi / 60 times it: "
         "it was probably converted from rpm by mistake]][[!rpm? ; either may be wrong]]",
     ),
-    "limits": Entry(
-        "warn",
-        "[[beyond its limits, {limits}, ]][[at? at its limits ]][[is clipped {side} {limit}, ]]"
-        "{share:%} of the time[[ ({logged})]]",
-        "[[{how:percent=is it in percent? then multiply scale in [log.input] by 0.01,widen=widen "
-        "[limits] if the robot can}]]",
-    ),
-    "same": Entry(
-        "note",
-        "[[the same signal as {of}]][[, {late:.3g} s later]][[constant within each trial "
-        "({values})]]",
-    ),
     "samples": Entry(
         "warn",
         "[[degrees? is in degrees: ]][[jumps by a full turn {count:time}]][[drops to {low} for "
         "single samples]][[has a new value only every {every:.3g} s]]"
-        "[[sticks to its last value, up to {stuck:.3g} s at a time, and then jumps]][[misses "
-        "samples, up to {gap:.3g} s at a time]][[comes in steps of {step}, as large as its "
-        "changes]][[ ({share:%})]]",
+        "[[sticks to its last value, up to {stuck:.3g} s at a time, and then jumps]]"
+        "[[ ({share:%})]]",
     ),
     "mismatch": Entry(
         "warn",

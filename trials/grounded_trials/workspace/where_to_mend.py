@@ -12,11 +12,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from grounded import findings as said
 from grounded.accounts.finding import Finding, late_effects
-from grounded.accounts.signals import judge_limits
 from grounded.trial import Trial
 from grounded_trials.logs.log_files import digest_of
 from grounded_trials.store.store import hash_file
@@ -24,7 +21,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.readings import UNCHANGED, Reading, readings_of
-from grounded_trials.workspace.user_files.task_file import seen_in
 
 
 def hashed(files: Sequence[Path]) -> str:
@@ -38,7 +34,6 @@ def where_to_mend(
 ) -> tuple[Finding, ...]:
     """Complete findings with the whole key of [log], or with advice if no trial was read by it."""
     about = {one.stored.id: one.meta for one in workspace.trials()}
-    findings = _at_limits(workspace, used, findings)
     fed = workspace.config.task.feedback
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
 
@@ -79,19 +74,3 @@ def _whole(finding: Finding, by: Mapping[str, Reading]) -> Mapping[str, Any]:
     if "delay_s" in keys:
         keys["delay_s"] = float(f"{keys['delay_s'] + now.delay_s:.3g}")
     return keys
-
-
-def _at_limits(
-    workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
-) -> Sequence[Finding]:
-    """Limit findings of saturated inputs to runs of candidates if [limits] were taken from a log.
-
-    The log itself reaches these limits by construction, and so do other manual drives.
-    """
-    if not seen_in(workspace.config):
-        return findings
-    inputs = [trial.inputs[: trial.known_steps] for trial in used if trial.candidate]
-    left = judge_limits(workspace.task, np.concatenate(inputs)) if inputs else ()
-    real = {one.signal: one for one in left if one.kind == "saturated"}
-    kept = (one for one in findings if one.kind != "saturated" or one.signal in real)
-    return [real[one.signal] if one.kind == "saturated" else one for one in kept]

@@ -374,7 +374,7 @@ def _still(trial: Trial) -> Iterator[Finding]:
 
 def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
     """Yield logged inputs that exceed [limits], which were taken from another log."""
-    from grounded.accounts.signals import beyond_limits, in_percent, limits_of, span
+    from grounded.accounts.signals import beyond_limits, limits_of, span
 
     task, mapping = workspace.task, workspace.log_mapping
     past = np.any(beyond_limits(task, trial.inputs), axis=0)
@@ -382,6 +382,6 @@ def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
     for i, name in enumerate(trial.input_names):
         if past[i]:
             turned = inside[i] and mapping is not None and mapping.inputs[name].scale < 0
-            how = "percent" if in_percent(task, trial.inputs, i) else "flip" if turned else "widen"
+            how = "flip" if turned else "widen"
             logged, limits = span(trial.inputs[:, i]), limits_of(task, i)
             yield found("log.limits", name, logged=logged, limits=limits, how=how)

@@ -18,7 +18,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.accounts.judge import contradicted
 from grounded.accounts.reported import scaled as scaled_columns
 from grounded.accounts.returned import (
     OTHERS,
@@ -26,7 +25,6 @@ from grounded.accounts.returned import (
     Story,
     Suspicion,
     likeliest,
-    of_full_scale,
     scored,
     stories,
     suspicion,
@@ -60,13 +58,12 @@ from grounded_trials.workspace.intake.recognising.look import (
     fall_in,
     sender_of,
 )
-from grounded_trials.workspace.intake.remarks.log_faults import column_faults, without
+from grounded_trials.workspace.intake.remarks.log_faults import column_faults, not_the_logs
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
-EXACT = 0.1  # largest difference, relative to the resolution of commands, of an exact match
 ENDED = ("stopped", "converged")  # phases of a search
 SHORTER = 1.0  # [nats] that a fall costs
 
@@ -86,7 +83,7 @@ def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
         raise error
     try:
         read = read_log_file(workspace, path, error.best, False)
-        seen = recognised(workspace, path, read, None, remedies=False)
+        seen = recognised(workspace, path, read, None)
     except OfEarlierTask:
         raise
     except GroundedError as refused:
@@ -126,8 +123,6 @@ class Case:
         self.log = log.recording if log else None
         self.guessed = {*self.log.names[0]} - {*self.log.measured} if self.log else set[str]()
         seen = self._judged(self.rivals)
-        if read.bare and (alone := self._judged(())).why:
-            seen = alone  # it may be of another workspace: resembling one of these is coincidence
         if self.log and read.log:
             seen = self._located(self.log, read.log, seen)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
@@ -137,8 +132,7 @@ class Case:
                 seen = replace(seen, why=None, other="")
         self.seen, judged = seen, read.log is not None and not seen.other
         self.fell = fall_in(self.task, self.own, self.read.trial, seen.ran) if judged else None
-        known = [] if read.bare else self.rivals
-        self.rival = next((one for one in known if one.id == seen.other), None)
+        self.rival = next((one for one in self.rivals if one.id == seen.other), None)
         self.again = NextCommand("ingest", (str(path) if read.log else "LOG",))
 
     @cached_property
@@ -227,17 +221,12 @@ class Case:
         """The faults of columns; none of them can be told without the commands."""
         trial, fell = replace(self.read.trial, id=""), self.fell
         known = trial.until(min(trial.known_steps, fell[0] if fell else trial.steps))
-        untold = self.read.bare or self.silent
-        return [] if untold else column_faults(self.workspace, known)
+        return [] if self.silent else column_faults(self.workspace, known)
 
     @property
     def silent(self) -> bool:
         """Whether commands are 0 throughout, though the plan moves them."""
         return self.seen.why is not None and self.seen.why.code == "log.silent"
-
-    def proven(self, fault: Account) -> list[str]:
-        """Return which stored trials, read by the same [log], contradict an exchange."""
-        return without(self.workspace, replace(self.read.trial, id=""), fault)
 
     def warned(self) -> Read:
         """Return the trial with what is doubtful about where it begins, or about its samples."""
@@ -254,9 +243,7 @@ class Case:
         return read
 
 
-def recognised(
-    workspace: Folder, path: Path, read: Read, candidate: str | None, *, remedies: bool = True
-) -> Read:
+def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None) -> Read:
     """Refuse a log whose commands are not its candidate's; only warn if the user named a candidate.
 
     A foreign log without a [log.span] may begin before the run: it is cut where the run begins.
@@ -266,7 +253,6 @@ def recognised(
         path: the log, for messages.
         read: what it contains.
         candidate: the candidate that the user named, if any.
-        remedies: find out why it seems to be nobody's run, which takes a minute for a long log.
 
     Raises:
         GroundedError: if it is not a run of its candidate, with what it is instead if known.
@@ -286,14 +272,10 @@ def recognised(
     alike = not case.seen.why
     story = likeliest(_of_trial(case), case.as_logged)
     if alike and story.kind is Kind.UNKNOWN:
-        told = _unlike(case)
-        read = cut_short(read, *fell) if fell else read
-        return read.telling(told) if told else read
-    if remedies or alike or case.rival or fell:
+        return cut_short(read, *fell) if fell else read
+    if case.rival is None:
         story = likeliest([story, *_of_log(case)], case.as_logged)
-    else:
-        story = of_earlier_task(workspace, case.log, case.whole) or story
-    if story.kind in (Kind.UNKNOWN, Kind.PROGRAM) and remedies:  # neither says how the robot moved
+    if story.kind in (Kind.UNKNOWN, Kind.PROGRAM):  # neither says how the robot moved
         story = next(_of_motion(case, story), story)
     if story.kind is Kind.FELL and fell:
         return cut_short(read, *fell)
@@ -318,12 +300,6 @@ def _of_trial(case: Case) -> Iterator[Story]:
 def _of_log(case: Case) -> Iterator[Story]:
     """Yield the stories of a log whose commands are not its candidate's."""
     log, task, own, fell = case.log, case.task, case.own, case.fell
-    if case.rival:  # with the columns put back, the commands are those of the one that ran
-        each = [
-            one for ran in (own, case.rival) if log for one in stories_of_log(log, task, ran, None)
-        ]
-        yield from (one for one in each if one.kind is Kind.LOG and len(one.names) == 2)
-        return
     if fell and case.seen.ran:
         error = np.nanmean((case.seen.ran.off / case.seen.ran.fine)[: fell[0]] ** 2) ** 0.5
         part = case.whole.until(fell[0])
@@ -332,8 +308,7 @@ def _of_log(case: Case) -> Iterator[Story]:
         yield from stories_of_log(log, task, own, case.found)
     if dead := [one for one in case.columns if one.code == "log.dead"]:
         yield replace(next(_of_columns(case, dead)), commands=-np.inf)
-    earlier = None if case.read.bare else of_earlier_task(case.workspace, log, case.whole)
-    if earlier:
+    if earlier := of_earlier_task(case.workspace, log, case.whole):
         yield earlier
 
 
@@ -350,8 +325,7 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
         start: the start that fits best, if any.
     """
     at = [*([start.seconds] if start else []), log.first, *log.openings[:TRIED]]
-    acts = not np.allclose(log.whole.inputs, own.policy.past, rtol=0, atol=1e-9)
-    how: dict[str, Any] = {"acts": acts, "logged": log.measured, "waits": log.waits}
+    how: dict[str, Any] = {"logged": log.measured, "waits": log.waits}
     some = list[Story]()
     for begins in dict.fromkeys(log.on_step(own.policy, one) for one in at):
         if trial := log.trial_from(begins):
@@ -403,44 +377,32 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
 
 def _where(case: Case, story: Story) -> Story:
     """Return a story of columns with where its fault lies: in the log, or on the robot."""
+    model, names, facts = case.task.model, story.names, dict[str, Any](ran=case.ran)
+    columns = tuple([*model.state_names, *model.input_names].index(name) for name in names)
+    trial, sent = replace(case.whole, id=""), {*names} <= {*model.input_names}
     if story.kind is Kind.UNIT:
-        return _in_unit(case, story)
-    if story.finding and story.finding.code == "log.exchange" and story.kind is Kind.LOG:
-        return _exchanged(case, story)
+        names = tuple(name for name in names if name not in case.guessed)
+        fault = Account("sign", columns, -1.0)
+        if (
+            story.by == -1
+            and sent
+            and (shown := not_the_logs(case.workspace, trial, fault, commands=True))
+        ):
+            told = found("run.sends", *names, times=-1).also(**facts, **shown)
+            return replace(story, kind=Kind.LOG, finding=told, rerun=True)
+        unit = unit_by_factor(model, names, story.by)
+        told = scaled_columns(model, names, 1 / story.by, unit).also(**facts)
+        if case.read.log is None:  # a program that writes trials
+            units = {**model.states, **model.inputs}
+            told = told.also(tables=(), writes=tuple(dict.fromkeys(units[name] for name in names)))
+        return replace(story, finding=told)
+    if story.finding and story.finding.code == "log.exchange" and len(columns) == 2:
+        fault = Account("exchange", pairs=((columns[0], columns[1]),))
+        if shown := not_the_logs(case.workspace, trial, fault, commands=True):
+            parts = "outputs" if sent else "states"
+            told = found("run.exchanged", *names, parts=parts, **(facts | shown))
+            return replace(story, finding=told, rerun=True)
     return story
-
-
-def _in_unit(case: Case, story: Story) -> Story:
-    """Return the story of columns times a factor: in the log, or sent so by the robot's program."""
-    names, by = tuple(n for n in story.names if n not in case.guessed), story.by
-    model, facts = case.task.model, {"ran": case.ran}
-    unit = unit_by_factor(model, names, by) or of_full_scale(case.task, names, by)
-    if shown := _sent_otherwise(case, names, by, unit):
-        told = found("run.sends", *names, times=1 / by).also(**facts, **shown)
-        return replace(story, kind=Kind.LOG, finding=told, rerun=True)
-    told = scaled_columns(model, names, 1 / by, unit).also(**facts)
-    if case.read.log is None:  # a program that writes trials
-        units = {**model.states, **model.inputs}
-        told = told.also(tables=(), writes=tuple(dict.fromkeys(units[name] for name in names)))
-    return replace(story, finding=told)
-
-
-def _exchanged(case: Case, story: Story) -> Story:
-    """Return what shows that two columns are exchanged: in the log, or by the robot's program.
-
-    If the model predicts the motion with the columns as they are read, the log is right, and the
-    program passed them on to the motors in each other's place. (With both [log] and the wires
-    exchanged a log looks the same, unless [log] read earlier trials well.)
-    """
-    (a, b), model, run = story.names, case.task.model, case.whole
-    every = (*model.state_names, *model.input_names)
-    fault = Account("exchange", pairs=((every.index(a), every.index(b)),))
-    facts = dict[str, Any](ran=case.ran, proven=tuple(case.proven(fault)))
-    if not contradicted(model, run.until(run.known_steps), range(model.n), fault):
-        return replace(story, finding=found("log.exchange", a, b, **facts))
-    parts = "states" if a in model.state_names else "outputs"
-    told = found("run.exchanged", a, b, parts=parts, moved="as the log says", **facts)
-    return replace(story, finding=told, rerun=True)
 
 
 def _refusal(case: Case, story: Story) -> GroundedError:
@@ -457,38 +419,10 @@ def _refusal(case: Case, story: Story) -> GroundedError:
     elif kind is Kind.CANDIDATE:
         then = NextCommand("ingest", (path, "--candidate", case.seen.other))
     elif kind is Kind.UNKNOWN:
-        then, bare = data, ran if case.read.bare else ""
-        if bare and told.code == "log.another":  # which may be coincidence
-            told = found("log.bare", ran=ran)
-        told = told.also(bare=bare, guessed=tuple(sorted(case.guessed)))
+        then, told = data, told.also(guessed=tuple(sorted(case.guessed)))
         if case.log and 0 < _lasting_s(case.log) < WHOLE * case.task.horizon * case.task.dt:
             told = told.also(lasts=Quantity(_lasting_s(case.log), "s"))
     return GroundedError(told.also(log=path).weighing(Weight.REFUSE), then)
-
-
-def _sent_otherwise(case: Case, names: Sequence[str], by: float, unit: str) -> dict[str, Any]:
-    """Return what shows that a program sent inputs times a number, as the log says.
-
-    Another scale in the log would spoil every later one. Nothing is returned if the log may have
-    another unit, or nothing tells.
-    """
-    model, trial, runs = case.workspace.base_model, case.whole, case.workspace.task_trials
-    if not {*names} <= {*model.input_names}:
-        return {}
-    if by == -1:
-        columns = tuple(model.n + model.input_names.index(name) for name in names)
-        fault, known = Account("sign", columns, -1.0), trial.until(trial.known_steps)
-        as_logged, mended = (
-            contradicted(model, one, range(model.n), fault, constant=False)
-            for one in (known, fault.mended(known))
-        )
-        if as_logged:
-            return {"moved": "as the log says"}
-        right = () if mended else tuple(case.proven(fault))
-    else:
-        known_unit = unit or by in (1e-3, 1e3)
-        right = () if known_unit else tuple(t.id for t in runs(measured=True) if t.candidate)
-    return {"proven": right} if right else {}
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
@@ -525,14 +459,6 @@ def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
     if best is not None and best.candidate.id not in [one.id for one in latest]:
         latest = [best.candidate, *latest]
     return latest, earlier
-
-
-def _unlike(case: Case) -> Finding | None:
-    """Return that a run whose commands are like its candidate's is another workspace's, or None."""
-    ran = case.seen.ran
-    if not case.read.bare or ran is None or np.nanmax(np.abs(ran.off) / ran.fine) < EXACT:
-        return None
-    return found("log.bare", ran=case.ran)
 
 
 def _like_task(policy: Policy, task: Task) -> bool:

@@ -4,12 +4,8 @@ A policy's plan, gains and reference change from step to step, so its commands c
 states arrive. Where they stay the same to the last digit all the same, the step was not run. A loop
 at half the rate runs every other step and holds each command twice as long.
 
-A policy takes what it is given for where the robot is now: at 1.8 m/s a pose that is 6.8 ms old is
-12 mm behind. Later candidates allow for the age that the commands show (`sample_age`).
-
-A run whose program passed `runner.action` the state and the seconds of a step before sent what was
-due then: that run says little about its candidate. If only the log has the commands late, the run
-counts. By the commands alone the two are one; `what_is_late` asks the robot's motion.
+Commands that are some steps late in a log were sent late or logged late: commands and states alone
+do not tell which.
 """
 
 from __future__ import annotations
@@ -21,7 +17,6 @@ from grounded.accounts.sent import (
     RESEMBLES,
     STEPS_TO_JUDGE,
     UNLIKE,
-    Following,
     as_sent,
     commanded,
     follows,
@@ -30,7 +25,6 @@ from grounded.accounts.sent import (
 from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.search.candidate import Candidate
-from grounded.search.feedback.sample_age import sample_age
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
@@ -38,7 +32,6 @@ from grounded_trials.workspace.folder import Folder
 CHANGES = 2e-3  # smallest change of a command by its step alone, relative to its size, that tells
 UNSENT = 5  # steps without a command that are fewer are sought where the run begins
 LOST = 0.3  # share of the steps that tell which may be lost in a run
-EARLIER = 3  # runs to compare with
 SAME = 0.4  # relative difference of two ages or lags that are one
 
 
@@ -63,50 +56,13 @@ def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
     some = stories(workspace.task, own, run, ran)
     if some and some[0].kind is Kind.PROGRAM:
         return some[0].finding
-    return _late(workspace, own, run, ran) if ran is not None and ran.alike else None
-
-
-def _late(workspace: Folder, own: Candidate, run: Trial, ran: Following) -> Finding | None:
-    """Return that a run's commands are some steps off: sent late, logged late, or cut wrongly.
-
-    Cut where its commands begin in the log, late commands seem to act on samples steps old.
-    """
-    from grounded.search.run_motion import Late, what_is_late
-
-    task, steps = workspace.task, ran.late
-    if not steps:
-        steps = round(sample_age(task, own, [run]) / task.dt)
-        before = _earlier(workspace, run.id, late=0)
-        if steps < 1 or what_is_late(workspace.planner, run, steps, before) is not Late.LOG:
-            return None
-        return found("log.late", ran=own.id, steps=steps, side="late", what="log")
-    if not ran.moved < UNLIKE:
+    if ran is None or not (ran.alike and ran.late and ran.moved < UNLIKE):
         return None
-    side = "late" if steps > 0 else "early"
-    if steps < 0 or ran.age <= (1 - SAME) * steps:  # the states acted on show a wrong start
-        return found("log.late", ran=own.id, steps=abs(steps), side=side, what="start")
-    before = _earlier(workspace, run.id, late=0)
-    what = what_is_late(workspace.planner, run, steps, before)
-    if own.policy.gain is None and what is Late.PROGRAM:  # nor does the start show in its commands
-        what = Late.EITHER
-    if what is Late.PROGRAM:
-        return found("run.late", ran=own.id, steps=steps, others=tuple(one.id for one in before))
-    return found("log.late", ran=own.id, steps=steps, side=side, what=what.value)
-
-
-def _earlier(workspace: Folder, but: str, late: int | None = None) -> list[Trial]:
-    """Return the latest other runs whose commands are their candidate's, and so late if given."""
-    some, task = list[Trial](), workspace.task
-    ids = workspace.candidate_ids()  # not of another policy of its name, nor of one that is gone
-    for one in reversed(workspace.task_trials()):
-        if len(some) == EARLIER:
-            break
-        if one.candidate in ids and one.id != but:
-            run = interpolate_gaps(one).trial.until(task.horizon)
-            ran = follows(workspace.candidate(one.candidate)[0].policy, run, latest(task))
-            if ran is not None and ran.alike and ran.late == (ran.late if late is None else late):
-                some.append(run)
-    return some[::-1]
+    # the states acted on show a wrong start
+    late, side = ran.late, "late" if ran.late > 0 else "early"
+    start = late < 0 or ran.age <= (1 - SAME) * late
+    what = "start" if start else "either"
+    return found("log.late", ran=own.id, steps=abs(late), side=side, what=what)
 
 
 def steps_skipped(task: Task, own: Candidate, trial: Trial) -> Finding | None:

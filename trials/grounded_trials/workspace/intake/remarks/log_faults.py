@@ -9,22 +9,23 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from grounded.accounts.sent import as_planned
+from grounded.accounts.commands import clocks_apart
+from grounded.accounts.judge import contradicted, judge
+from grounded.accounts.reported import names_of, reported
+from grounded.accounts.sent import as_planned, follows, latest
+from grounded.accounts.table import Account, Told
 from grounded.findings import Finding, found
 from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.readings import paths_of, read_by
 
-if TYPE_CHECKING:
-    from grounded.accounts.table import Account, Told
-
-TURNS = 5.0  # times its bound in [safety] from which on an angle is suspect
 COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
 KINDS = "unit sign compass exchange dead offset axes pace clock"
 COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
@@ -45,8 +46,6 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
     faults = column_faults(workspace, known)
-    if not any(one.code == "log.unit" for one in faults):
-        faults += _beyond_safety(workspace.task, trial)
     faults += _clocks_apart(workspace, trial)
     return tuple(_mended(workspace, known, one, own=own) for one in faults)
 
@@ -58,8 +57,6 @@ def column_faults(workspace: Folder, known: Trial) -> list[Finding]:
         workspace: the workspace with the model.
         known: the trial up to its last known step.
     """
-    from grounded.accounts.judge import judge
-
     model = workspace.base_model
     if known.steps < 2:
         return []
@@ -69,10 +66,8 @@ def column_faults(workspace: Folder, known: Trial) -> list[Finding]:
 
 def _told(workspace: Folder, known: Trial, told: Told) -> Iterator[Finding]:
     """Yield an account as faults of the log, or of the robot."""
-    from grounded.accounts.reported import reported
-
     first, *others = reported(workspace.base_model, told)
-    if told.account.kind == "exchange" and (why := _on_the_robot(workspace, known, told.account)):
+    if told.account.kind == "exchange" and (why := not_the_logs(workspace, known, told.account)):
         inputs = min(told.account.touched) >= workspace.base_model.n
         yield found("run.exchanged", *first.about, parts="wires" if inputs else "sensors", **why)
         return
@@ -108,23 +103,31 @@ def _limits(task: Task, known: Trial, one: Finding) -> Iterator[str]:
             yield f"{name} = [{low}, {high}]"
 
 
-def _on_the_robot(workspace: Folder, trial: Trial, fault: Account) -> dict[str, Any]:
-    """Return what shows that an exchange is not the log's; empty if it may be.
+def not_the_logs(
+    workspace: Folder, trial: Trial, fault: Account, *, commands: bool = False
+) -> dict[str, Any]:
+    """Return what shows that a sign or an exchange is not the log's; empty if it may be.
 
-    It is not if other trials that [log] read in the same way show none, or if the commands are
-    those of the candidate only as they are logged: the program then had the same columns.
+    Which term needs it tells where it lies: the log, if both the commands of its candidate and the
+    motion are right without it; the program, if the robot moved as logged; the robot, if the
+    program sent as logged. Other trials that [log] read in the same way may show none.
+
+    Args:
+        workspace: the workspace with the model and the trials.
+        trial: the trial, with gaps bridged.
+        fault: the sign or exchange.
+        commands: they need it; else the motion does.
     """
+    model, known = workspace.base_model, trial.until(trial.known_steps)
+    if commands and contradicted(model, known, range(model.n), fault):
+        return {"moved": "as the log says"}
     if right := without(workspace, trial, fault):
         return {"proven": tuple(right)}
     return {"ran": trial.candidate} if _as_sent(workspace, trial, fault) else {}
 
 
 def without(workspace: Folder, trial: Trial, fault: Account) -> list[str]:
-    """Return the other trials that were read in the same way and contradict an exchange."""
-    from grounded.accounts.judge import contradicted
-    from grounded.accounts.reported import names_of
-    from grounded_trials.workspace.last_diagnosis import diagnosable
-
+    """Return the other trials that were read in the same way and contradict a fault."""
     model, mapping = workspace.base_model, workspace.log_mapping
     names = names_of(model, sorted(fault.touched))
     metas = {one.stored.id: one.meta for one in workspace.whole_trials()}
@@ -142,9 +145,7 @@ def without(workspace: Folder, trial: Trial, fault: Account) -> list[str]:
 
 
 def _as_sent(workspace: Folder, trial: Trial, fault: Account) -> bool:
-    """Return whether a run's commands are its candidate's, and would not be without an exchange."""
-    from grounded.accounts.sent import follows, latest
-
+    """Return whether a run's commands are its candidate's, and would not be without a fault."""
     if trial.candidate not in workspace.candidate_ids():
         return False
     policy, late = workspace.candidate(trial.candidate)[0].policy, latest(workspace.task)
@@ -153,25 +154,8 @@ def _as_sent(workspace: Folder, trial: Trial, fault: Account) -> bool:
     return logged is not None and logged.alike and not (mended is not None and mended.alike)
 
 
-def _beyond_safety(task: Task, trial: Trial) -> list[Finding]:
-    """Return faults for angles far beyond [safety] that would be about inside in degrees."""
-    from grounded.accounts.reported import scaled
-    from grounded.accounts.table import DEGREES
-
-    assert task.safety_low is not None and task.safety_high is not None
-    allowed = np.maximum(np.abs(task.safety_low), np.abs(task.safety_high))
-    turns = np.nan_to_num(np.abs(trial.states)).max(axis=0, initial=0.0) / np.maximum(
-        allowed, 1e-12
-    )
-    units, odd = list(task.model.states.items()), (turns > TURNS) & (turns <= DEGREES * 2)
-    odd &= np.array([unit == "rad" for _, unit in units])
-    return [scaled(task.model, [units[i][0]], DEGREES, "deg") for i in np.flatnonzero(odd)]
-
-
 def _clocks_apart(workspace: Folder, trial: Trial) -> list[Finding]:
     """Return a fault if measured states respond to commands before they are sent."""
-    from grounded.accounts.commands import answers_early
-
     model, estimates = workspace.base_model, workspace.config.estimate
     measured: Collection[str] = model.state_names
     if estimates.names():
@@ -179,5 +163,5 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Finding]:
 
         measured = read_estimate(estimates, model).measured
     shown = [i for i, name in enumerate(model.state_names) if name in measured]
-    early = answers_early(model, trial, shown)
-    return [early.finding(model, shown)] if early else []
+    early = clocks_apart(model, trial, shown)
+    return [early] if early else []
