@@ -97,8 +97,16 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
         shown: indices of the states with a sensor.
         account: the fault, of another trial.
     """
-    seen = _Seen(model, trial, (), shown, [account])
-    return seen.gains.get(account, 0.0) < -HINT
+    known, ones = known_states(trial, shown), np.ones(model.m)
+    seconds = horizon_of(trial, known)
+    logged, mended = (  # a command at its limit may make a constant rate
+        Ahead(model, one, known, 2 * STARTS, constant=False, horizon=seconds)
+        for one in (trial, account.mended(trial))
+    )
+    if not (logged.enough and mended.enough):
+        return False
+    with np.errstate(all="ignore"):
+        return mended.plain(ones).missed - logged.plain(ones).missed > HINT
 
 
 # --- by rows --------------------------------------------------------------------------------------

@@ -8,7 +8,7 @@ import pytest
 import grounded as gr
 from facts import holds
 from grounded import Model, Param
-from grounded.accounts.commands import answers_early, judge_clocks
+from grounded.accounts.commands import clocks_apart, judge_clocks
 from grounded.errors import GroundedError
 from grounded.trial import Trial
 
@@ -48,10 +48,6 @@ def driven(model, *, early=0, seed=0, dt=0.02, steps=900, hold=15):
     return Trial(states, sent, dt, model.state_names, model.input_names, id=f"t{seed:04}")
 
 
-def every(model):
-    return range(model.n)
-
-
 REAL = craft(lag=0.15, drag=0.7, gain=0.8)
 
 
@@ -61,9 +57,10 @@ def test_states_before_their_commands_are_told_by_how_much(early, blind):
     trial = driven(REAL, early=early)
     if blind:  # no sensor of the speeds
         trial = replace(trial, states=trial.states * [1, 1, np.nan, np.nan])
-    found = answers_early(craft(), trial, every(craft()))
-    assert found is not None and found.seconds == pytest.approx(0.02 * early, abs=0.04)
-    assert found.mended < found.logged / 2 and found.state in range(2 if blind else 4)
+    found = clocks_apart(craft(), trial, range(4))
+    assert found is not None and found.facts["lead"] == pytest.approx(0.02 * early, abs=0.04)
+    assert found.facts["mended"].value < found.facts["logged"].value / 2
+    assert found.about == craft().state_names[: 2 if blind else 4]
 
 
 def test_a_diagnosis_stops_at_them_and_names_the_delay():

@@ -1,7 +1,6 @@
 """The instruments, judged from their own signals: known faults of generated ones, real ones."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -125,19 +124,6 @@ def test_samples_that_show_nothing_become_missing(fault, kind, lost):
     assert one.share == pytest.approx(sum(gone) / 402)
 
 
-def test_coarse_missing_and_clipped_samples_are_stated_and_left():
-    def coarse(y):
-        y = np.round(y / [0.2, 1e-9]) * [0.2, 1e-9]
-        y[100:110, 1] = np.nan
-        return y
-
-    found = preflight(ARM, arm(coarse))
-    assert {(f.signal, f.kind) for f in found.findings} == {("q", "quantised"), ("w", "missing")}
-    assert not any(f.corrected for f in found.findings)
-    clipped = preflight(ARM, arm(columns(w=lambda x: np.minimum(x, 0.7))))
-    assert ("w", "saturated") in {(f.signal, f.kind) for f in clipped.findings}
-
-
 def test_jumps_by_a_full_turn_are_taken_out():
     def turn(y, full):
         y = y + np.array([3.0, 0])
@@ -149,18 +135,6 @@ def test_jumps_by_a_full_turn_are_taken_out():
         assert [f.kind for f in found.findings] == [kind]
         steps = np.concatenate([np.diff(t.states[:, 0]) for t in found.trials])
         assert np.abs(steps).max() < 0.3
-
-
-def test_inputs_that_are_copies_or_constant_are_stated():
-    model = replace(ARM, inputs={"u": "N m", "seen": "N m", "kp": "1"})
-    trials = []
-    for k, t in enumerate(arm(trials=4)):
-        u = t.inputs[:, 0]
-        inputs = np.stack([u, np.concatenate([u[:1], u[:1], u[:-2]]), np.full(len(u), k)], axis=1)
-        trials.append(Trial(t.states, inputs, DT, ("q", "w"), ("u", "seen", "kp")))
-    found = {f.signal: f for f in preflight(model, trials).findings}
-    assert {n: f.kind for n, f in found.items()} == {"seen": "copy", "kp": "constant"}
-    assert found["seen"].delay_s == pytest.approx(2 * DT, rel=0.02)
 
 
 BEAM = Model(

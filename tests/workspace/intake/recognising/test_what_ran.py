@@ -144,9 +144,8 @@ def said_to_have_run(candidate, run, to, steps=sys.maxsize, nudge=0.0):
 def test_a_trial_that_names_its_candidate_is_not_given_to_another(waiting, tmp_path):
     w, ran, _ = waiting
     other = said_to_have_run("c0002", ran, tmp_path / "x.mcap")
-    with pytest.raises(GroundedError, match="another workspace") as refused:
+    with pytest.raises(GroundedError, match="are those of c0001") as refused:
         w.ingest(other)
-    assert "--candidate c0001" not in str(refused.value)  # which would be refused in turn
     assert refused.value.then == NextCommand("ingest", (str(other), "--data"))
     assert w.ingest(other, candidate="c0002").candidate == "c0002"
 
@@ -217,25 +216,6 @@ def test_the_candidate_after_a_false_crash_is_not_handed_out_once_that_is_discar
     new = w.propose()
     assert (new.candidate.id, new.candidate.base, new.candidate.caution) == ("c0003", "c0001", 0)
     assert any("c0002" in note and "set aside" in note for note in again.notes)
-
-
-def test_a_run_of_another_workspace_s_candidate_is_told(tmp_path):
-    """Two copies of a task with other weights: their first candidates send nearly the same."""
-    here, there = (
-        Workspace(make(tmp_path / name, config=CONFIG.replace("x = 10.0", weight)).folder)
-        for name, weight in (("here", "x = 10.0"), ("there", "x = 300.0"))
-    )
-    for w in (here, there):
-        w.propose()
-    log = there.run()
-    trial = read_trial(log.trial_file)[0]
-    stored = here.ingest(log.trial_file, data=True)
-    assert of_code(stored, "log.elsewhere")
-    write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial"})
-    told = here.ingest(tmp_path / "bare.mcap")
-    assert of_code(told, "log.bare")
-    assert not there.ingest(tmp_path / "bare.mcap").warnings
-    assert not there.ingest(log.trial_file, data=True).notes
 
 
 def test_a_run_without_its_feedback_is_named(tmp_path, before=0.7):

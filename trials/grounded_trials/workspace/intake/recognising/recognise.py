@@ -378,7 +378,8 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
 def _where(case: Case, story: Story) -> Story:
     """Return a story of columns with where its fault lies: in the log, or on the robot."""
     model, names, facts = case.task.model, story.names, dict[str, Any](ran=case.ran)
-    columns = tuple([*model.state_names, *model.input_names].index(name) for name in names)
+    every = (*model.state_names, *model.input_names)
+    columns = tuple(every.index(name) for name in names if name in every)
     trial, sent = replace(case.whole, id=""), {*names} <= {*model.input_names}
     if story.kind is Kind.UNIT:
         names = tuple(name for name in names if name not in case.guessed)
@@ -416,9 +417,9 @@ def _refusal(case: Case, story: Story) -> GroundedError:
         then = NextCommand("next", ("LOG",))
     elif kind is Kind.ROBOT:
         then = NextCommand("export", (ran, "--runner"))
-    elif kind is Kind.CANDIDATE:
+    elif kind is Kind.CANDIDATE and case.read.log:
         then = NextCommand("ingest", (path, "--candidate", case.seen.other))
-    elif kind is Kind.UNKNOWN:
+    elif kind in (Kind.UNKNOWN, Kind.CANDIDATE):
         then, told = data, told.also(guessed=tuple(sorted(case.guessed)))
         if case.log and 0 < _lasting_s(case.log) < WHOLE * case.task.horizon * case.task.dt:
             told = told.also(lasts=Quantity(_lasting_s(case.log), "s"))
