@@ -1,5 +1,5 @@
 """The commands of `grounded`: each parses its options, calls `grounded_trials.Workspace`, prints.
 
-Read `main.py` first: it lists the commands with their files and turns errors into exit codes.
-`console/` has what they share: options, output of text, tables and progress, shell completion.
+Read `commands.py` first: it declares every command; what one does is in the module of its name.
+`main.py` turns errors into exit codes, `console/` has what commands share.
 """

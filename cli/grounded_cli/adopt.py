@@ -4,32 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import click
-
-from grounded_cli.console import completion as complete
-from grounded_cli.console.options import command, flag, misuse
+from grounded_cli.console.options import misuse
 from grounded_cli.console.terminal import field, sentence, show, tell
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import ALONE, moved
 from grounded_trials.workspace.adoption import Adopted, Undone, numbers_in
 
 DIGITS = 4  # of a parameter, at least
 
 
-@command("adopt")
-@click.argument("effects", nargs=-1, metavar="EFFECT...", shell_complete=complete.effects)
-@flag("--effect-only", help="Leave the model's own parameters alone.")
-@flag("--undo", help="Undo the last adoption.")
 def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[Adopted | Undone]:
-    """Add effects of the last diagnosis (`family:target`) to [model] in grounded.toml.
-
-    Effects that were claimed together were estimated together: adopt them together. The model
-    parameters calibrated with them are written to [model] params. An effect that was not claimed
-    can be adopted alone: its values come without parameters.
-
-    The search goes on from the best policy and plans with the better model. --undo restores the
-    effects and parameters that [model] had before the last adoption; repeat it to go further back.
-    """
+    """Adopt effects, or undo the last adoption; print what changed."""
     if undo == bool(effects) or (undo and effect_only):
         raise misuse("EFFECT...", "--undo")
     workspace = open_workspace()

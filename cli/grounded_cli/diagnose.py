@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from functools import partial
 from typing import Any
-
-import click
 
 from grounded.accounts.finding import Finding
 from grounded.diagnosis.parts import Diagnosis
@@ -18,13 +15,12 @@ from grounded.diagnosis.telling import (
     sentence,
     told,
 )
-from grounded.engine import Engine
+from grounded.engine import Engine, cores
 from grounded.findings import Weight
 from grounded.refusals import wrong
-from grounded_cli.console import completion as complete
-from grounded_cli.console.options import chosen_trials, command, flag, parallel
+from grounded_cli.console.options import names_of
 from grounded_cli.console.terminal import field, names_in, show, stages, table, tell, tinted
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.propose import show_extent
 from grounded_trials.wording import percent
 from grounded_trials.workspace.candidates.trust import extent_of
@@ -33,48 +29,24 @@ from grounded_trials.workspace.last_diagnosis import left_out
 from grounded_trials.workspace.next_step import BEFORE_TRIALS
 
 
-@command("diagnose")
-@chosen_trials
-@click.option(
-    "--max-effects",
-    type=click.IntRange(1, 12),
-    metavar="K",
-    help="Claim at most K effects, 1 to 12 (default: 3, more if they leave a gap).",
-)
-@click.option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
-@click.option(
-    "--compare",
-    nargs=2,
-    metavar="A B",
-    shell_complete=complete.trials,
-    help="Two groups of trials, T1,T2 T3,T4: what changed.",
-)
-@partial(parallel, by_itself=True)
-@flag("--instruments", help="Check the sensors only; takes some seconds.")
-@flag("--details", help="Also all findings, errors, rival effects and places.")
 def diagnose(
-    trials: tuple[str, ...],
+    trials: str | None,
     max_effects: int | None,
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
-    engine: Engine,
+    jobs: int | None,
     instruments: bool,
     details: bool,
 ) -> Iterator[Any]:
-    """Explain the sim-to-real gap from the stored trials; keeps reports/diagnosis.json.
-
-    The verdict is one effect, several, none (the rest is noise, or cannot be told from it) or
-    unknown (a gap that no known effect explains). If two effects tie, a probe is written: a
-    candidate whose trial would tell them apart.
-    """
-    workspace = open_workspace()
+    """Diagnose the trials, check their sensors, or compare two groups."""
+    workspace, chosen = open_workspace(), names_of(trials, "--trials", "t0001,t0002")
     first, second = map(names_in, compare or ("", ""))
-    if compare and (trials or not (first and second) or {*first} & {*second}):
+    if compare and (chosen or not (first and second) or {*first} & {*second}):
         raise wrong(
             "--compare", got=" ".join(compare), must="groups", like="t0001,t0002 t0003,t0004"
         )
     if instruments:
-        findings, alone = workspace.preflight(trials), unheld_in(workspace, trials)
+        findings, alone = workspace.preflight(chosen), unheld_in(workspace, chosen)
         yield {"preflight": [one.to_json() for one in findings], "unheld": list(alone)}
         _instruments(findings, workspace.base_model.inputs)
         if alone:
@@ -84,14 +56,14 @@ def diagnose(
         return show(f"\n{next_line(workspace.status().then)}")
     with stages() as stage:
         found = workspace.diagnose(
-            trials or first,
+            chosen or first,
             max_effects=max_effects,
             without=[name for text in without for name in names_in(text)],
             compare=second,
-            engine=engine,
+            engine=Engine(jobs or cores()),
             progress=stage,
         )
-    left = () if trials or first else left_out(workspace)
+    left = () if chosen or first else left_out(workspace)
     tell([*left, *unwritten_in(workspace)], all_=True)
     yield found
     assert found.then is not None

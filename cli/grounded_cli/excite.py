@@ -4,24 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import click
-
 from grounded.result import with_unit
-from grounded_cli.console.options import command
 from grounded_cli.console.terminal import field, number, progress, show, table, tell
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.workspace.exciting import Excited
 
 
-@command("excite")
-@click.option("--seconds", type=float, help="Its duration (5 to 40, until no parameter is weak).")
 def excite(seconds: float | None) -> Iterator[Excited]:
-    """Write a drive that makes the model's uncertain parameters identifiable.
-
-    It needs no target: multisines or staircases on all inputs, from [task] start, inside [limits]
-    and, by the model, inside [safety]. The table says how well its log will tell each parameter if
-    the model is right but for these: `fit` and `diagnose` say how well it did.
-    """
+    """Write the drive to record first."""
     workspace = open_workspace()
     with progress("designing a drive"):
         made = workspace.excite(seconds)

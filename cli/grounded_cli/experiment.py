@@ -11,7 +11,7 @@ import click
 from grounded.engine import Engine
 from grounded.experiments import car, flight, footnote9, theorem1
 from grounded.refusals import wrong
-from grounded_cli.console.options import command, misuse, parallel
+from grounded_cli.console.options import misuse
 from grounded_cli.console.terminal import bar, show, table
 from grounded_trials.store.documents import StudyStore
 
@@ -24,42 +24,23 @@ STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
 }
 
 
-@command("experiment", workspace=False)
-@click.argument("name", type=click.Choice(list(STUDIES)), metavar="[NAME]", required=False)
-@click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
-@parallel
-@click.option(
-    "--keep", metavar="DIR", help="Where finished jobs are kept (default: .grounded-studies/NAME)."
-)
 def experiment(
-    name: str | None, seeds: str | None, engine: Engine, keep: str | None
+    name: str | None, seeds: str | None, jobs: int | None, keep: str | None
 ) -> Iterator[Any]:
-    """Run one of the paper's studies; the same seeds give the same results on any machine.
-
-    Without NAME the studies are listed. Finished jobs are kept, so an interrupted study resumes.
-    """
+    """Run a study, or list all."""
     if name is None:
         yield {"studies": {key: text for key, (_, _, text) in STUDIES.items()}}
         return show("\n".join(f"{key:15} {text}" for key, (_, _, text) in STUDIES.items()))
     study, kind, _ = STUDIES[name]
     given: dict[str, Any] = _seeds(seeds, kind, name)
-    if kind:
-        given |= {
-            "engine": engine,
-            "finished": StudyStore(Path(keep or f".grounded-studies/{name}")),
-        }
     with bar(name) as progress:
         if kind:
-            given["progress"] = progress
+            kept = StudyStore(Path(keep or f".grounded-studies/{name}"))
+            given |= {"engine": Engine(jobs or 1), "finished": kept, "progress": progress}
         result = study(**given)
     yield result
     for one in result.tables():
         show(f"{one.title}\n\n{table(one.rows, one.head)}\n")
-
-
-def _unlike(text: str) -> click.UsageError:
-    """Return the error of --seeds that select nothing that the study can run."""
-    return click.UsageError(str(wrong("--seeds", got=text, like="8 or 0-7")))
 
 
 def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
@@ -68,20 +49,15 @@ def _seeds(text: str | None, kind: str, name: str) -> dict[str, Any]:
         return {}
     if not kind:
         raise misuse(name, "--seeds")
+    first, dash, last = text.partition("-")
     try:
-        if "-" in text:
-            first, last = (int(part) for part in text.split("-"))
-            chosen = list(range(first, last + 1))
-        elif "," in text:
-            chosen = [int(part) for part in text.split(",")]
+        if dash:
+            chosen = [*range(int(first), int(last) + 1)]
         else:
-            chosen = list(range(int(text)))
+            chosen = [*map(int, text.split(","))] if "," in text else [*range(int(text))]
     except ValueError:
-        raise _unlike(text) from None
-    if not chosen:
-        raise _unlike(text)
-    if kind == "seeds":
-        return {"seeds": chosen}
-    if chosen != list(range(chosen[0], chosen[-1] + 1)):
-        raise _unlike(text)
-    return {"count": len(chosen), "first_seed": chosen[0]}
+        chosen = []
+    in_row = chosen and chosen == [*range(chosen[0], chosen[-1] + 1)]
+    if not (chosen and (kind == "seeds" or in_row)):
+        raise click.UsageError(str(wrong("--seeds", got=text, like="8 or 0-7")))
+    return {"seeds": chosen} if kind == "seeds" else {"count": len(chosen), "first_seed": chosen[0]}

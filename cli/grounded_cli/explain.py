@@ -6,8 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from typing import Any
 
-import click
-
 from grounded.diagnosis.causes import in_words
 from grounded.effects import Family, Scales, Site
 from grounded.errors import GroundedError, alike
@@ -15,16 +13,13 @@ from grounded.findings.catalogue import WEIGHTS, codes, entry_of
 from grounded.findings.numbers import bare
 from grounded.models import car, pendulum
 from grounded.refusals import refused
-from grounded_cli.console.options import command
 from grounded_cli.console.terminal import field, show
-from grounded_cli.console.workspace_option import open_workspace
+from grounded_cli.console.workspace import open_workspace
 from grounded_trials.workspace.adopted import installed_effects
 
 
-@command("explain", workspace=False)
-@click.argument("name", metavar="[CODE|EFFECT]", required=False, default="")
 def explain(name: str) -> Iterator[dict[str, Any]]:
-    """Print what the CODE of a finding, or an EFFECT or its family, means; without, list all."""
+    """Print what a code or an effect means, or list all."""
     family, _, target = name.partition(":")
     findings = {one: vars(entry_of(one)) for one in codes() if name in ("", one)}
     library = installed_effects().families

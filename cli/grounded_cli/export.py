@@ -5,15 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import click
-
 from grounded.diagnosis.parts import Estimate
 from grounded.errors import NextCommand
 from grounded.findings import found
-from grounded_cli.console import completion as complete
-from grounded_cli.console.options import anyway, command, flag, misuse
+from grounded_cli.console.options import misuse
 from grounded_cli.console.terminal import field, show, table, tell
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.workspace.candidates.exporting import Exported
 from grounded_trials.workspace.home.library import Shelved
 from grounded_trials.workspace.home.taking_home import TakenHome
@@ -21,30 +18,6 @@ from grounded_trials.workspace.home.taking_home import TakenHome
 FORMATS = ("csv", "npz", "json")
 
 
-@command("export")
-@click.argument("candidate", metavar="ID", required=False, shell_complete=complete.candidates)
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(FORMATS),
-    help="Default: by the ending of FILE, without one json; of a trial csv.",
-)
-@click.option(
-    "-o",
-    "--output",
-    metavar="FILE",
-    help="Default: ID.FORMAT in the current folder, even with -C DIR; `next` writes into DIR.",
-)
-@flag(
-    "--runner", help="Write npz, and beside it grounded_runner.py, which runs it with numpy alone."
-)
-@flag("--model", help="Write the model with the values found: MJCF, URDF or model.py.")
-@click.option(
-    "--library",
-    metavar="FILE.yaml",
-    help="Write what is known of one actuator; ID is its input (default: the only one).",
-)
-@anyway
 def export(
     candidate: str | None,
     form: str | None,
@@ -54,18 +27,7 @@ def export(
     library: str | None,
     anyway: bool,
 ) -> Iterator[Exported | Shelved | TakenHome]:
-    """Write a candidate as csv, npz or json, with units and the time base in the file.
-
-    A trial (t0007) can be written as csv or npz.
-
-    `best` names the best candidate so far. A candidate that must not be run any more (see
-    `grounded run`) is refused. One that was run in an earlier task is allowed if it keeps to the
-    current [limits] and [safety].
-
-    --model writes the model as it is now, fitted values and adopted effects, in the form that it
-    came in; all else of that file stays as it is. --library writes one actuator, from which another
-    workspace begins (`grounded init --actuators`).
-    """
+    """Write a candidate, a trial, the model, or an actuator."""
     for_robot = form or runner or anyway
     if library is not None and not (model or output or for_robot):
         shelved = open_workspace().export_actuator(library, candidate)

@@ -4,29 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from functools import partial
-
-import click
 
 from grounded.diagnosis.telling import instrument_lines
-from grounded.engine import Engine
+from grounded.engine import Engine, cores
 from grounded.fit import Fit
 from grounded.fit.result import FittedValue
 from grounded.model import Model
-from grounded.refusals import wrong
 from grounded.result import listed
-from grounded_cli.console.options import chosen_trials, command, flag, parallel
+from grounded_cli.console.options import names_of
 from grounded_cli.console.terminal import (
     field,
     lines,
-    names_in,
     number,
     show,
     stages,
     table,
     tell,
 )
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import or_zero, shown
 from grounded_trials.workspace.fitting import Fitted
 
@@ -37,26 +32,20 @@ HELD_OUT = (
 DIGITS, MOST = 4, 7  # significant digits of a value, usually and at most
 
 
-@command("fit")
-@chosen_trials
-@click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
-@flag("--latency", help="Fit one transport delay of all inputs too.")
-@flag("--apply", help="Write the values to grounded.toml.")
-@partial(parallel, by_itself=True)
 def fit(
-    trials: tuple[str, ...], params: str | None, latency: bool, apply: bool, engine: Engine
+    trials: str | None, params: str | None, latency: bool, apply: bool, jobs: int | None
 ) -> Iterator[Fitted]:
-    """Estimate parameters by maximum likelihood of the trials, noise included.
-
-    Sensor faults (a delay, filtered speeds, degrees) are corrected first, as in `diagnose`.
-    Trials are predicted with values from the others; values that predict worse are never written.
-    """
-    workspace, names = open_workspace(), names_in(params) or None
-    if params is not None and names is None:
-        raise wrong("--params", got=params, like="a1,L")
+    """Fit parameters; print them with their intervals and held-out errors."""
+    workspace, names = open_workspace(), names_of(params, "--params", "a1,L")
+    chosen, engine = names_of(trials, "--trials", "t0001,t0002"), Engine(jobs or cores())
     with stages() as stage:
         done = workspace.fit(
-            names, trials=trials, latency=latency, apply=apply, engine=engine, progress=stage
+            names or None,
+            trials=chosen,
+            latency=latency,
+            apply=apply,
+            engine=engine,
+            progress=stage,
         )
     yield done
     found = done.fit

@@ -7,15 +7,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-import click
-
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.model import Model
-from grounded_cli.console import options
-from grounded_cli.console.options import command, flag, json_asked, values_by_name
+from grounded_cli.console.options import json_asked, values_by_name
 from grounded_cli.console.terminal import field, number, progress, show, table, tell
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.propose import tell_proposed
 from grounded_trials.logs.log_files import logs_in
 from grounded_trials.wording import extent, with_unit
@@ -26,15 +23,6 @@ FINDINGS_TOLD = 3  # findings that are told without --details
 ASIDE = "set aside"  # a verdict
 
 
-@command("ingest")
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
-@options.which_candidate
-@flag("--data", help="The log ran no candidate: for fit and diagnose only.")
-@click.option("--group", default="", metavar="NAME", help="A condition that no signal shows: wet.")
-@click.option(
-    "--before", multiple=True, metavar="U=0", help="An input before a log that begins with a step."
-)
-@options.details
 def ingest(
     files: tuple[str, ...],
     candidate: str | None,
@@ -43,12 +31,7 @@ def ingest(
     before: tuple[str, ...],
     details: bool,
 ) -> Iterator[dict[str, Any]]:
-    """Check, resample and store logs of any format that `inspect` reads.
-
-    Ingesting a file again succeeds and names the trial it is stored as. Trials written by grounded
-    are stored unchanged; other logs are mapped by the [log] table (`grounded inspect LOG` prints
-    one).
-    """
+    """Store logs, and print what became of each."""
     workspace, held = open_workspace(), values_by_name(before, "--before")
     about: Any = {"candidate": candidate, "data": data, "group": group, "before": held}
     done = []
@@ -62,16 +45,8 @@ def ingest(
     show(f"\n{next_line(done[-1].then)}")
 
 
-@command("next")
-@click.argument("log", metavar="LOG")
-@options.which_candidate
-@options.details
 def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRun]:
-    """Ingest a log, show the verdict, propose, and export for the robot.
-
-    Does the same as `ingest LOG`, `propose` and `export ID --runner`, or `export` in the format in
-    which the last candidate was exported; the file is written into the workspace's folder.
-    """
+    """Ingest a log, propose, and export for the robot."""
     workspace = open_workspace()
     with progress(f"reading {log} and planning"):
         done = workspace.next(log, candidate=candidate)

@@ -13,10 +13,9 @@ import click
 
 from grounded.findings import found as finding
 from grounded.result import listed
-from grounded_cli.console import completion as complete
-from grounded_cli.console.options import command, flag, json_asked, misuse, table_layout
+from grounded_cli.console.options import json_asked, misuse
 from grounded_cli.console.terminal import LABEL, field, names_in, progress, sentence, show, tell
-from grounded_cli.console.workspace_option import next_line
+from grounded_cli.console.workspace import next_line
 from grounded_trials import Workspace
 from grounded_trials.formats.tables import Layout
 from grounded_trials.logs.inspection.guess import Guess, estimating
@@ -27,42 +26,6 @@ from grounded_trials.starting.examples import EXAMPLES
 ALTERNATIVES = 8  # alternative signals listed for an unsure state or input
 
 
-@command("init", workspace=False)
-@click.argument("folder", metavar="DIR", required=False)
-@click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
-@click.option(
-    "--model",
-    metavar="FILE",
-    help="Your model.py, or an MJCF or URDF file, beside --from or --blank.",
-)
-@flag("--blank", help="No log yet: a workspace of --model, to fill in.")
-@click.option(
-    "--kind",
-    help="Kind of model skeleton: car, rover, differential, boat, balance, drone, arm, pendulum, "
-    "crane, generic.",
-)
-@click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
-@table_layout
-@click.option(
-    "--dt",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="Control interval (the log's; 0.05 with --blank).",
-)
-@click.option(
-    "--actuators",
-    multiple=True,
-    metavar="FILE[:INPUT,...]",
-    help="Begin with an actuator that `export --library` wrote, for inputs of its unit or these.",
-)
-@flag("--yes", help="Ask nothing: use the best guesses, marked as such.")
-@click.option(
-    "--example",
-    metavar="NAME",
-    shell_complete=complete.examples,
-    help="Which example (see --list).",
-)
-@flag("--list", help="List the examples.")
 def init(
     folder: str | None,
     log: str | None,
@@ -70,27 +33,22 @@ def init(
     blank: bool,
     kind: str | None,
     inputs: str | None,
-    layout: Layout,
+    columns: str | None,
+    rate: float | None,
     dt: float | None,
     actuators: tuple[str, ...],
     yes: bool,
     example: str | None,
     list: bool,
 ) -> Iterator[Begun | dict[str, Any]]:
-    """Make a workspace in DIR: grounded.toml, model.py, target.csv, trials/, candidates/.
-
-    --from LOG finds the model's states and inputs in a log and says why it chose them; without
-    --model it also writes a model skeleton for the kind of robot in the log. --blank --model FILE
-    needs no log and writes drive.py, the robot's program. --example NAME copies an example, whose
-    real.py simulates the robot.
-    """
+    """Make a workspace of a log, a model or an example."""
     if list:
         yield {"examples": {key: value.text for key, value in EXAMPLES.items()}}
         return show("\n".join(f"{key:15} {value.text}" for key, value in EXAMPLES.items()))
     if folder is None or [log is not None, example is not None, blank].count(True) != 1:
         raise misuse("DIR --from LOG", "DIR --example NAME", "DIR --blank --model FILE")
     of_logs: dict[str, Any] = {"--kind": kind, "--inputs": inputs, "--yes": yes}
-    of_logs |= {"--columns": layout.columns, "--rate": layout.rate}
+    of_logs |= {"--columns": columns, "--rate": rate}
     if not log and (foreign := [key for key, given in of_logs.items() if given]):
         raise misuse("--from LOG", foreign[0], how="first")
     if example is not None and (model or dt):
@@ -100,7 +58,8 @@ def init(
     if log is not None:
         asked = None if yes or json_asked() or not sys.stdin.isatty() else _ask
         with progress(f"reading {log}"):
-            about: Any = {"model": model, "kind": kind, "dt": dt, "layout": layout}
+            about: Any = {"model": model, "kind": kind, "dt": dt}
+            about["layout"] = Layout(tuple(names_in(columns)), rate or 0.0)
             begun = begin(Path(folder), log, inputs=names_in(inputs), ask=asked, **about)
         _with(folder, actuators)
         yield begun

@@ -4,11 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-import click
-
-from grounded_cli.console.options import command, table_layout
-from grounded_cli.console.terminal import number, progress, remark, show, table
-from grounded_cli.console.workspace_option import given, next_line, typed
+from grounded_cli.console.terminal import names_in, number, progress, remark, show, table
+from grounded_cli.console.workspace import given, next_line, typed
 from grounded_trials.formats.tables import Layout
 from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
@@ -20,15 +17,9 @@ from grounded_trials.workspace.inspecting import Inspected, inspect_in
 FOLDED_FIELDS = 9
 
 
-@command("inspect")
-@click.argument("log", metavar="LOG")
-@table_layout
-def inspect(log: str, layout: Layout) -> Iterator[Inspected]:
-    """Show topics, types, rates and fields of a log, and a ready-made [log] table.
-
-    The table is guessed for the states and inputs of the workspace; `unsure` marks lines to check.
-    There is no table for files written by grounded, for damaged files, and outside a workspace.
-    """
+def inspect(log: str, columns: str | None, rate: float | None) -> Iterator[Inspected]:
+    """Print topics, types, rates and fields of a log, and its [log] table."""
+    layout = Layout(tuple(names_in(columns)), rate or 0.0)
     with progress(f"reading {log}"):
         found = inspect_in(Folder(given() or "."), log, layout)
     if found.why_none:

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-import click
-
 from grounded.findings import Finding, Weight
 from grounded.search.candidate import Candidate
-from grounded_cli.console import completion as complete
-from grounded_cli.console.options import anyway, command
 from grounded_cli.console.terminal import (
     number,
     progress,
@@ -20,7 +16,7 @@ from grounded_cli.console.terminal import (
     tell,
     tinted,
 )
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.status import summary
 from grounded_trials import Workspace
 from grounded_trials.workspace.candidates.proposing import Status
@@ -28,16 +24,8 @@ from grounded_trials.workspace.candidates.running import Ran
 from grounded_trials.workspace.intake.ingest import Ingested
 
 
-@command("run")
-@click.argument("candidate", required=False, shell_complete=complete.candidates)
-@anyway
 def run(candidate: str | None, anyway: bool) -> Iterator[Ran]:
-    """Run the candidate on [system] and write a trial file for `grounded ingest`.
-
-    CANDIDATE defaults to the outstanding one. Any candidate may be run again, also `best`; its
-    utilities are averaged. It is refused if its file was rewritten, or if [limits], [safety], the
-    task or the model changed so that it must not be run any more.
-    """
+    """Run the candidate on [system]."""
 
     def warn(one: Finding) -> None:
         tell([one.weighing(Weight.WARN)])
@@ -50,10 +38,8 @@ def run(candidate: str | None, anyway: bool) -> Iterator[Ran]:
     show(f"\n{next_line(ran.then)}")
 
 
-@command("learn")
-@click.option("--trials", type=click.IntRange(min=1), metavar="N", help="At most N trials now.")
 def learn(trials: int | None) -> Iterator[Status]:
-    """Propose, run and ingest until the search ends; it can be interrupted and resumed."""
+    """Learn until the search ends."""
     status = narrated(open_workspace(), trials)
     yield status
     show(summary(status))

@@ -6,22 +6,15 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 
-from grounded_cli.console.options import command, details
 from grounded_cli.console.terminal import LABEL, field, number, show, stages, tell
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.proposing import Proposed
 from grounded_trials.workspace.candidates.trust import Extent
 
 
-@command("propose")
-@details
 def propose(details: bool) -> Iterator[Proposed]:
-    """Show what to run next and write its candidate file.
-
-    The outstanding candidate is shown again while its trial is missing. Nothing is proposed once
-    the search has ended.
-    """
+    """Print what to run next, what it will do, and whether to trust it."""
     with stages() as tick:
         tick("planning")
         proposed = open_workspace().propose(tick)

@@ -5,25 +5,17 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-import click
-
 from grounded.errors import NextCommand
-from grounded_cli.console.options import command, exits
+from grounded_cli.console.options import exits
 from grounded_cli.console.terminal import field, progress, say, show
-from grounded_cli.console.workspace_option import next_line
+from grounded_cli.console.workspace import next_line
 from grounded_trials.logs.recover import Recovery, recover_log
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.wording import count
 
 
-@command("recover", workspace=False)
-@click.argument("log", metavar="LOG")
-@click.option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
 def recover(log: str, output: str | None) -> Iterator[Recovery]:
-    """Recover what is readable in a damaged MCAP file; exit with 3 if something was lost.
-
-    The damaged file is not changed.
-    """
+    """Save the readable part of a damaged log."""
     source = Path(log)
     target = Path(output) if output else source.with_name(f"{source.stem}-recovered.mcap")
     with progress(f"reading {log}"):

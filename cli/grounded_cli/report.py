@@ -10,22 +10,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from grounded.refusals import refused
-from grounded_cli.console.options import command, exits, flag, json_asked
+from grounded_cli.console.options import exits, json_asked
 from grounded_cli.console.terminal import progress, remark, say, show, sparkline, table
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.report.report_text import report_text
 from grounded_trials.report.reporting import Report
 
 
-@command("report")
-@flag("--html", help="Write reports/report.html, one page with everything.")
-@flag("--png", help="Write the page's figures as pictures, reports/*.png.")
-@flag("--rrd", help="Write reports/recording.rrd for the Rerun viewer.")
 def report(html: bool, png: bool, rrd: bool) -> Iterator[Report]:
-    """Show utilities, trajectories, bias and gap of all stored trials.
-
-    A damaged or missing trial is left out and named (exit code 3).
-    """
+    """Print the report, or write its files."""
     with progress("reading trials"):
         report = open_workspace().report(html=html, png=png, rrd=rrd)
     exits(3 if report.findings.lost else 0)
@@ -39,13 +32,8 @@ def report(html: bool, png: bool, rrd: bool) -> Iterator[Report]:
     show(f"\n{next_line(report.findings.then)}")
 
 
-@command("view", json=False)
 def view() -> Iterator[Path]:
-    """Open the recording in the Rerun viewer: paths, states, inputs, bias, trial by trial.
-
-    The file reports/recording.rrd is written first. If this machine has no screen, copy the file to
-    one that has (with the extra `view`) and open it there: rerun recording.rrd
-    """
+    """Write the recording and open it."""
     with progress("writing the recording"):
         path = open_workspace().report(rrd=True).paths[-1]
     yield path

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from grounded_cli.console.options import command, details, exits
+from grounded_cli.console.options import exits
 from grounded_cli.console.terminal import (
     field,
     number,
@@ -16,7 +16,7 @@ from grounded_cli.console.terminal import (
     table,
     tell,
 )
-from grounded_cli.console.workspace_option import next_line, open_workspace
+from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import count, legend, wrapped
 from grounded_trials.workspace.candidates.proposing import Status
 from grounded_trials.workspace.verifying import Verified
@@ -24,10 +24,8 @@ from grounded_trials.workspace.verifying import Verified
 LEGEND = "damp: penalty on leaving the last trial's inputs; +-: standard error"
 
 
-@command("status")
-@details
 def status(details: bool) -> Iterator[Status]:
-    """Show where the search stands, from the stored trials; nothing is written."""
+    """Print where the search stands."""
     with progress("reading trials"):
         status = open_workspace().status()
     yield status
@@ -40,9 +38,8 @@ def status(details: bool) -> Iterator[Status]:
     show(f"\n{next_line(status.then)}")
 
 
-@command("verify")
 def verify() -> Iterator[Verified]:
-    """Find stored files that were changed, damaged, deleted or replaced."""
+    """Check the stored files."""
     with progress("checking"):
         found = open_workspace().verify()
     exits(1 if found.damaged else 0)

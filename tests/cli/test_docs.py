@@ -324,10 +324,10 @@ def test_every_room_says_where_to_begin_and_names_files_that_are_there():
 
 
 def test_every_command_is_documented():
-    from grounded_cli.main import COMMANDS
+    from grounded_cli.commands import cli
 
     text = "\n".join(page.read_text() for page in PAGES)
-    missing = [name for name in COMMANDS if f"grounded {name}" not in text]
+    missing = [name for name in cli.commands if f"grounded {name}" not in text]
     if not (ROOT / "README.md").read_text().count("```") > 4:
         pytest.skip("README.md is not written yet")
     assert not missing, f"no page shows {missing}"

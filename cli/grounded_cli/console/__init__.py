@@ -1,7 +1,8 @@
-"""What the commands share: their options, their output, and the shell's completion.
+"""What the commands share: their options and their output.
 
-workspace_option  START HERE: the option -C, and the next command to type for its workspace
-options           the other options that several commands have
-terminal          output of text, tables, progress and JSON
-completion        completes candidates, trials and effects; the command that installs it
+Read `options.py` first.
+
+options    `command`, which declares a command, and options that several have
+workspace  the folder of the option -C, and the next command to type for it
+terminal   output of text, tables, progress and JSON
 """

@@ -1,44 +1,52 @@
-"""`command`, which makes a function a command, and the options that several commands share."""
+"""`command`, which declares a command, the options of several commands, and their values."""
 
 from __future__ import annotations
 
 import functools
+import gc
 import math
 from collections.abc import Callable, Iterator
+from importlib import import_module
 from typing import Any, TypeVar
 
 import click
 
 from grounded.findings import found
 from grounded.refusals import wrong
-from grounded_cli.console import completion as complete
 from grounded_cli.console.terminal import names_in, show_json, stdout_kept
-from grounded_cli.console.workspace_option import in_workspace
+from grounded_cli.console.workspace import located
 
 F = TypeVar("F", bound=Callable[..., Any])
 _CODE = "grounded_cli.code"
 
 
 def command(
-    name: str, *, workspace: bool = True, json: bool = True, **settings: Any
-) -> Callable[[Callable[..., Iterator[Any]]], click.Command]:
-    """Make a function a command, with the options -C and --json.
+    group: click.Group, name: str, module: str = "", *, workspace: bool = True, json: bool = True
+) -> Callable[[Callable[[], None]], click.Command]:
+    """Make a function's options and docstring a command, with the options -C and --json.
 
-    The function yields its result, and then tells it to a person: with --json, the document of the
-    result is printed instead. stdout is kept for either, whatever the user's code prints.
+    What the command does is the function of the same name in a module of `grounded_cli`, which is
+    imported when it is called. It gets the options, yields its result, and then tells it to a
+    person: with --json, the document of the result is printed instead. stdout is kept for either,
+    whatever the user's code prints.
 
     Args:
+        group: where it belongs.
         name: the command.
+        module: where its function is; "": in the module of the command's name.
         workspace: whether it takes -C.
         json: whether it takes --json.
-        **settings: those of `click.command`.
     """
 
-    def made(function: Callable[..., Iterator[Any]]) -> click.Command:
-        @functools.wraps(function)
-        def call(*args: Any, json_: bool = False, **options: Any) -> int:
+    def made(declared: Callable[[], None]) -> click.Command:
+        def call(json_: bool = False, **options: Any) -> int:
+            function: Callable[..., Iterator[Any]]
+            function = getattr(import_module(f"grounded_cli.{module or name}"), declared.__name__)
+            if not gc.isenabled():  # see `main`
+                gc.freeze()
+                gc.enable()
             with stdout_kept():
-                telling = function(*args, **options)
+                telling = function(**options)
                 done = next(telling)
                 if json_:
                     show_json(done if isinstance(done, dict) else done.to_json())
@@ -47,15 +55,46 @@ def command(
             code: int = click.get_current_context().meta.get(_CODE, 0)
             return code
 
-        found = click.command(name, cls=click.Command, **settings)(call)
+        functools.update_wrapper(call, declared)  # its help and its parameters
+        made = click.command(name, cls=click.Command)(call)
         if workspace:
-            in_workspace(found)
+            in_workspace(made)
         if json:
             text = "Print one JSON document."
-            found.params.append(click.Option(["--json", "json_"], is_flag=True, help=text))
-        return found
+            made.params.append(click.Option(["--json", "json_"], is_flag=True, help=text))
+        group.add_command(made)
+        return made
 
     return made
+
+
+def in_workspace(command: click.Command) -> None:
+    """Add the option -C DIR to the group or a command; `given` returns its value."""
+    text = "The workspace (default: here)."
+    option = click.Option(["-C"], metavar="DIR", expose_value=False, callback=located, help=text)
+    command.params.append(option)
+
+
+def flag(*names: str, help: str) -> Callable[[F], F]:
+    """Add an option without a value."""
+    return click.option(*names, is_flag=True, help=help)
+
+
+def parallel(default: str) -> Callable[[F], F]:
+    """Add --jobs to a command that can run in parallel."""
+    text = f"Workers on this machine (default: {default})."
+    return click.option("--jobs", type=click.IntRange(1), metavar="N", help=text)
+
+
+def table_layout(declared: F) -> F:
+    """Add --columns and --rate: what a table without names or times lacks."""
+    above, rows = click.FloatRange(min=0, min_open=True), "Rows a second of a table without times."
+    declared = click.option("--rate", type=above, metavar="HZ", help=rows)(declared)
+    columns = "Columns of a table without names."
+    return click.option("--columns", metavar="A,B,...", help=columns)(declared)
+
+
+# for the modules of commands
 
 
 def exits(code: int) -> None:
@@ -66,35 +105,6 @@ def exits(code: int) -> None:
 def json_asked() -> bool:
     """Return whether the running command was given --json."""
     return bool(click.get_current_context().params.get("json_"))
-
-
-def flag(*names: str, help: str) -> Callable[[F], F]:
-    """Add an option without a value."""
-    return click.option(*names, is_flag=True, help=help)
-
-
-details = flag("--details", help="Tell all notes, with codes.")
-anyway = flag(
-    "--anyway", help="Hand the candidate over even if [limits], [safety], task or model changed."
-)
-
-
-def parallel(function: Callable[..., Any], by_itself: bool = False) -> Callable[..., Any]:
-    """Add the options of a command that can run in parallel, passed as `engine`.
-
-    by_itself: it runs on all processors unless --jobs says otherwise.
-    """
-    default = "all processors" if by_itself else "1"
-    workers = f"Workers on this machine (default: {default})."
-
-    @click.option("--jobs", type=click.IntRange(1), metavar="N", help=workers)
-    @functools.wraps(function)
-    def call(*args: Any, jobs: int | None, **others: Any) -> Any:
-        from grounded.engine import Engine, cores
-
-        return function(*args, engine=Engine(jobs or (cores() if by_itself else 1)), **others)
-
-    return call
 
 
 def misuse(*options: str, how: str = "one") -> click.UsageError:
@@ -117,35 +127,9 @@ def values_by_name(pairs: tuple[str, ...], option: str) -> dict[str, float]:
     return values
 
 
-def table_layout(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Add --columns and --rate, passed as `layout`: what a table without names or times lacks."""
-    above, rows = click.FloatRange(min=0, min_open=True), "Rows a second of a table without times."
-
-    @click.option("--columns", metavar="A,B,...", help="Columns of a table without names.")
-    @click.option("--rate", type=above, metavar="HZ", help=rows)
-    @functools.wraps(function)
-    def call(*args: Any, columns: str | None, rate: float | None, **others: Any) -> Any:
-        from grounded_trials.formats.tables import Layout
-
-        return function(*args, layout=Layout(tuple(names_in(columns)), rate or 0.0), **others)
-
-    return call
-
-
-def _trial_names(ctx: click.Context, option: click.Parameter, text: str | None) -> tuple[str, ...]:
-    chosen = tuple(names_in(text))
-    if text is not None and not chosen:
-        raise wrong("--trials", got=text, like="t0001,t0002")
-    return chosen
-
-
-chosen_trials = click.option(
-    "--trials",
-    metavar="T1,T2,...",
-    shell_complete=complete.trials,
-    callback=_trial_names,
-    help="Only these trials (default: all).",
-)
-which_candidate = click.option(
-    "--candidate", metavar="ID", shell_complete=complete.candidates, help="Which candidate was run."
-)
+def names_of(text: str | None, option: str, like: str) -> list[str]:
+    """Return the names in an option such as --trials t0001,t0002; [] if it was not given."""
+    names = names_in(text)
+    if text is not None and not names:
+        raise wrong(option, got=text, like=like)
+    return names

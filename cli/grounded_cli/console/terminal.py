@@ -18,7 +18,7 @@ from typing import Any, TextIO
 from grounded.findings.finding import Finding, Weight
 from grounded.progress import duration
 from grounded.result import plain
-from grounded_cli.console.workspace_option import given
+from grounded_cli.console.workspace import given
 from grounded_trials.wording import MARKS, columns, figure, glued, placed, wrapped
 
 number = figure

@@ -15,33 +15,16 @@ if TYPE_CHECKING:
 _KEY = "grounded_cli.folder"
 
 
-def in_workspace(command: click.Command) -> None:
-    """Add the option -C DIR to the group or a command; `given` returns its value."""
-    text = "The workspace (default: here)."
-    option = click.Option(
-        ["-C"], metavar="DIR", expose_value=False, callback=_remembered, help=text
-    )
-    command.params.append(option)
-
-
-def _remembered(ctx: click.Context, option: click.Parameter, folder: str | None) -> None:
+def located(ctx: click.Context, option: click.Parameter | None, folder: str | None) -> None:
+    """Note the folder of -C, or of a workspace that a command made, for its further commands."""
     if folder is not None:
         ctx.meta[_KEY] = folder
 
 
-def given(ctx: click.Context | None = None) -> str | None:
-    """Return the folder of -C, or None if it was not given.
-
-    Args:
-        ctx: the command's context; None: that of the running command.
-    """
-    ctx = ctx or click.get_current_context(silent=True)
+def given() -> str | None:
+    """Return the folder of -C of the running command, or None if it was not given."""
+    ctx = click.get_current_context(silent=True)
     return None if ctx is None else ctx.meta.get(_KEY)
-
-
-def located(folder: str) -> None:
-    """Print the running command's further commands with the -C of a folder that it made."""
-    click.get_current_context().meta[_KEY] = folder
 
 
 def open_workspace() -> Workspace:
@@ -50,7 +33,7 @@ def open_workspace() -> Workspace:
     Raises:
         GroundedError: if its grounded.toml is missing or invalid.
     """
-    from grounded_trials import Workspace
+    from grounded_trials import Workspace  # only commands that have a workspace need it
 
     return Workspace(given() or ".")
 

@@ -1,0 +1,502 @@
+"""Every command with its options and its help; what a command does is in a module of its own.
+
+A command's module is imported when it is called: `--help`, the TAB key and a misuse import none.
+`command` (in `console/options.py`) finds there the function of the same name as the one here.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import click
+
+from grounded import __version__
+from grounded.errors import GroundedError
+from grounded.refusals import unknown
+from grounded_cli.console.options import command, flag, in_workspace, parallel, table_layout
+from grounded_cli.console.workspace import given, next_line
+from grounded_trials.wording import placed
+
+
+class Commands(click.Group):
+    """A group that lists its commands in the order of use."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        """Return the command names, in the order of use."""
+        return list(self.commands)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Suggest the nearest name for an unknown command."""
+        if args[0] not in self.commands and not args[0].startswith("-"):
+            ctx.fail(str(unknown("command", args[0], self.commands)))
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run a command; append the command to type next to the message of a GroundedError."""
+        try:
+            return super().invoke(ctx)
+        except GroundedError as error:
+            then = "" if error.then is None else f"\n{next_line(error.then)}"
+            raise GroundedError(f"{placed(str(error), given())}{then}") from None
+
+
+@click.command(cls=Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="grounded")
+def cli() -> None:
+    """Teach a real system a manoeuvre in a few trials, from a crude model.
+
+    Start with `grounded demo car-figure8` in an empty folder, or make a workspace of your own with
+    `grounded init DIR --example car-turn`.
+    """
+
+
+in_workspace(cli)
+details = flag("--details", help="Tell all notes, with codes.")
+anyway = flag(
+    "--anyway", help="Hand the candidate over even if [limits], [safety], task or model changed."
+)
+only_trials = click.option(
+    "--trials", metavar="T1,T2,...", help="Only these trials (default: all)."
+)
+which_candidate = click.option("--candidate", metavar="ID", help="Which candidate was run.")
+without = click.option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
+folder = click.argument("folder", metavar="DIR")
+
+
+# a workspace, its manoeuvre, its first drive
+
+
+@command(cli, "init", workspace=False)
+@click.argument("folder", metavar="DIR", required=False)
+@click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
+@click.option(
+    "--model",
+    metavar="FILE",
+    help="Your model.py, or an MJCF or URDF file, beside --from or --blank.",
+)
+@flag("--blank", help="No log yet: a workspace of --model, to fill in.")
+@click.option(
+    "--kind",
+    help="Kind of model skeleton: car, rover, differential, boat, balance, drone, arm, pendulum, "
+    "crane, generic.",
+)
+@click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
+@table_layout
+@click.option(
+    "--dt",
+    type=click.FloatRange(min=0, min_open=True),
+    metavar="SECONDS",
+    help="Control interval (the log's; 0.05 with --blank).",
+)
+@click.option(
+    "--actuators",
+    multiple=True,
+    metavar="FILE[:INPUT,...]",
+    help="Begin with an actuator that `export --library` wrote, for inputs of its unit or these.",
+)
+@flag("--yes", help="Ask nothing: use the best guesses, marked as such.")
+@click.option("--example", metavar="NAME", help="Which example (see --list).")
+@flag("--list", help="List the examples.")
+def init() -> None:
+    """Make a workspace from a log or an example.
+
+    DIR gets grounded.toml, model.py, target.csv, trials/ and candidates/. --from LOG finds the
+    model's states and inputs in a log and says why it chose them; without --model it also writes a
+    model skeleton for the kind of robot in the log. --blank --model FILE needs no log and writes
+    drive.py, the robot's program. --example NAME copies an example, whose real.py simulates the
+    robot.
+    """
+
+
+@command(cli, "target")
+@click.argument("shape", metavar="SHAPE|FILE")
+@click.option(
+    "--size",
+    type=float,
+    help="Length of a line, radius of a circle, half the width of a figure-8's loops [m] (2).",
+)
+@click.option("--speed", type=float, help="Maximum speed [m/s] (1).")
+@click.option("--accel", type=float, help="Maximum acceleration along the path [m/s^2] (1).")
+@click.option("--lateral", type=float, help="Maximum lateral acceleration [m/s^2] (4).")
+@click.option("--laps", type=float, help="Laps of a circle or figure-8 (1).")
+@click.option("--hold", type=float, help="Time at rest at a path's end [s] (0).")
+@click.option(
+    "--to",
+    multiple=True,
+    metavar="STATE=VALUE",
+    help="Where a line, step or swing-up ends; what a state keeps along a path (a height). "
+    "A velocity along a line or path follows it, and must end at this value.",
+)
+@click.option(
+    "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
+)
+@flag("--rest", help="Let the states that a line leaves free rest at its end, by weights.")
+@details
+def target() -> None:
+    """Draw the manoeuvre: line, circle, figure-8, step or swing-up.
+
+    FILE is a log, read through [log], a stored trial (t0001), or a CSV with columns `t` and states.
+    Paths start from rest and keep to the given speeds and accelerations. A line with --to, or of a
+    robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
+    --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
+    angle that hangs under its weight upright; --to names another angle, or more states. A path
+    begins at the position in [task] start, along x, and a figure-8 at its crossing: its length lies
+    45 degrees to the right of x.
+
+    The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. If
+    [task] start is empty and a stored trial begins at rest, it is set to where. [task] horizon is
+    updated, and so are the weights in [reward] state unless you chose them, and input_change of
+    inputs with [limits] if it is still what `init` wrote. Earlier trials stay available to fit and
+    diagnose; the search starts again.
+    """
+
+
+@command(cli, "excite")
+@click.option("--seconds", type=float, help="Its duration (5 to 40, until no parameter is weak).")
+def excite() -> None:
+    """Write the drive to record first, before there is a target.
+
+    It makes the model's uncertain parameters identifiable: multisines or staircases on all inputs,
+    from [task] start, inside [limits] and, by the model, inside [safety]. The table says how well
+    its log will tell each parameter if the model is right but for these.
+    """
+
+
+# the loop
+
+
+@command(cli, "propose")
+@details
+def propose() -> None:
+    """Say what to run next and write its candidate file.
+
+    The outstanding candidate is shown again while its trial is missing. Nothing is proposed once
+    the search has ended.
+    """
+
+
+@command(cli, "run", "learn")
+@click.argument("candidate", required=False)
+@anyway
+def run() -> None:
+    """Run the candidate on the system of grounded.toml.
+
+    It writes a trial file for `grounded ingest`. CANDIDATE defaults to the outstanding one. Any may
+    be run again, also `best`; its utilities are averaged. It is refused if its file was rewritten,
+    or if [limits], [safety], the task or the model changed so that it must not be run any more.
+    """
+
+
+@command(cli, "ingest")
+@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@which_candidate
+@flag("--data", help="The log ran no candidate: for fit and diagnose only.")
+@click.option("--group", default="", metavar="NAME", help="A condition that no signal shows: wet.")
+@click.option(
+    "--before", multiple=True, metavar="U=0", help="An input before a log that begins with a step."
+)
+@details
+def ingest() -> None:
+    """Check, resample and store the log of a run.
+
+    It may have any format that `inspect` reads. Ingesting a file again succeeds and names the trial
+    it is stored as. Trials written by grounded are stored unchanged; other logs are mapped by the
+    [log] table (`grounded inspect LOG` prints one).
+    """
+
+
+@command(cli, "next", "ingest")
+@click.argument("log", metavar="LOG")
+@which_candidate
+@details
+def following() -> None:
+    """Ingest a log, propose, and export for the robot, in one go.
+
+    Does the same as `ingest LOG`, `propose` and `export ID --runner`, or `export` in the format in
+    which the last candidate was exported; the file is written into the workspace's folder.
+    """
+
+
+@command(cli, "discard")
+@click.argument("trials", nargs=-1, required=True, metavar="TRIAL...")
+@click.option("--why", default="", metavar="TEXT", help="The reason; `status` shows it.")
+def discard() -> None:
+    """Set a trial aside; nothing is deleted.
+
+    Search, fit, diagnosis and report leave it out, and the search goes on as if it had not been
+    run. `grounded restore` undoes it.
+    """
+
+
+@command(cli, "restore", "discard")
+@click.argument("trials", nargs=-1, required=True, metavar="TRIAL...")
+def restore() -> None:
+    """Use a discarded trial again."""
+
+
+@command(cli, "learn")
+@click.option("--trials", type=click.IntRange(min=1), metavar="N", help="At most N trials now.")
+def learn() -> None:
+    """Propose, run and ingest until the search ends.
+
+    It can be interrupted and resumed.
+    """
+
+
+# what it came to
+
+
+@command(cli, "status")
+@details
+def status() -> None:
+    """Show where the search stands.
+
+    It follows from the stored trials; nothing is written.
+    """
+
+
+@command(cli, "report")
+@flag("--html", help="Write reports/report.html, one page with everything.")
+@flag("--png", help="Write the page's figures as pictures, reports/*.png.")
+@flag("--rrd", help="Write reports/recording.rrd for the Rerun viewer.")
+def report() -> None:
+    """Summarise all trials: text, page, pictures, recording.
+
+    A damaged or missing trial is left out and named (exit code 3).
+    """
+
+
+@command(cli, "view", "report", json=False)
+def view() -> None:
+    """Open the recording in Rerun.
+
+    The file reports/recording.rrd is written first. If this machine has no screen, copy the file to
+    one that has (with the extra `view`) and open it there: rerun recording.rrd
+    """
+
+
+@command(cli, "fit")
+@only_trials
+@click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
+@flag("--latency", help="Fit one transport delay of all inputs too.")
+@flag("--apply", help="Write the values to grounded.toml.")
+@parallel("all processors")
+def fit() -> None:
+    """Estimate the model's parameters from all trials.
+
+    They are the most likely ones, noise included. Sensor faults (a delay, filtered speeds, degrees)
+    are corrected first, as in `diagnose`. Trials are predicted with values from the others; values
+    that predict worse are never written.
+    """
+
+
+@command(cli, "diagnose")
+@only_trials
+@click.option(
+    "--max-effects",
+    type=click.IntRange(1, 12),
+    metavar="K",
+    help="Claim at most K effects, 1 to 12 (default: 3, more if they leave a gap).",
+)
+@without
+@click.option(
+    "--compare",
+    nargs=2,
+    metavar="A B",
+    help="Two groups of trials, T1,T2 T3,T4: what changed.",
+)
+@parallel("all processors")
+@flag("--instruments", help="Check the sensors only; takes some seconds.")
+@flag("--details", help="Also all findings, errors, rival effects and places.")
+def diagnose() -> None:
+    """Find where the model is wrong, and which effect explains it.
+
+    The verdict, kept in reports/diagnosis.json, is one effect, several, none (the rest is noise, or
+    cannot be told from it) or unknown (a gap that no known effect explains). If two effects tie, a
+    probe is written: a candidate whose trial would tell them apart.
+    """
+
+
+@command(cli, "adopt")
+@click.argument("effects", nargs=-1, metavar="EFFECT...")
+@flag("--effect-only", help="Leave the model's own parameters alone.")
+@flag("--undo", help="Undo the last adoption.")
+def adopt() -> None:
+    """Add diagnosed effects to the model.
+
+    They are written as `family:target` to [model] in grounded.toml. Effects that were claimed
+    together were estimated together: adopt them together. The model parameters calibrated with them
+    are written to [model] params. An effect that was not claimed can be adopted alone: its values
+    come without parameters.
+
+    The search goes on from the best policy and plans with the better model. --undo restores the
+    effects and parameters that [model] had before the last adoption; repeat it to go further back.
+    """
+
+
+# logs and files
+
+
+@command(cli, "inspect")
+@click.argument("log", metavar="LOG")
+@table_layout
+def inspect() -> None:
+    """Show what is in a log and guess its [log] table.
+
+    The table is guessed for the states and inputs of the workspace; `unsure` marks lines to check.
+    There is none for files written by grounded, for damaged files, and outside a workspace.
+    """
+
+
+@command(cli, "recover", workspace=False)
+@click.argument("log", metavar="LOG")
+@click.option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
+def recover() -> None:
+    """Recover what is readable in a damaged log.
+
+    It exits with 3 if something was lost. The damaged MCAP file is not changed.
+    """
+
+
+@command(cli, "export")
+@click.argument("candidate", metavar="ID", required=False)
+@click.option(
+    "--format",
+    "form",
+    type=click.Choice(("csv", "npz", "json")),
+    help="Default: by the ending of FILE, without one json; of a trial csv.",
+)
+@click.option(
+    "-o",
+    "--output",
+    metavar="FILE",
+    help="Default: ID.FORMAT in the current folder, even with -C DIR; `next` writes into DIR.",
+)
+@flag(
+    "--runner", help="Write npz, and beside it grounded_runner.py, which runs it with numpy alone."
+)
+@flag("--model", help="Write the model with the values found: MJCF, URDF or model.py.")
+@click.option(
+    "--library",
+    metavar="FILE.yaml",
+    help="Write what is known of one actuator; ID is its input (default: the only one).",
+)
+@anyway
+def export() -> None:
+    """Write a candidate for the robot: csv, npz or json.
+
+    `best` names the best candidate so far; a trial (t0007) can be written as csv or npz. A
+    candidate that must not be run any more (see `grounded run`) is refused. One that was run in an
+    earlier task is allowed if it keeps to the current [limits] and [safety].
+
+    --model writes the model as it is now, fitted values and adopted effects, in the form that it
+    came in; all else of that file stays as it is. --library writes one actuator, from which another
+    workspace begins (`grounded init --actuators`).
+    """
+
+
+@command(cli, "verify", "status")
+def verify() -> None:
+    """Check every stored file against its hash."""
+
+
+# to try it, to check it
+
+
+@command(cli, "demo", workspace=False)
+@click.argument("name", metavar="[NAME]", default="car-figure8")
+@click.option("--dir", "folder", metavar="DIR", help="Default: demo-NAME in the current folder.")
+def demo() -> None:
+    """Run a whole example in a new folder: learn, diagnose, report.
+
+    `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
+    which the search never sees.
+    """
+
+
+@command(cli, "experiment", workspace=False)
+@click.argument(
+    "name",
+    type=click.Choice(("flight", "car", "footnote9", "theorem1")),
+    metavar="[NAME]",
+    required=False,
+)
+@click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
+@parallel("1")
+@click.option(
+    "--keep", metavar="DIR", help="Where finished jobs are kept (default: .grounded-studies/NAME)."
+)
+def experiment() -> None:
+    """Reproduce the paper's studies.
+
+    The same seeds give the same results on any machine. Without NAME the studies are listed.
+    Finished jobs are kept, so an interrupted study resumes.
+    """
+
+
+@cli.group("challenge")
+def challenge() -> None:
+    """Make, diagnose and score blind cases for the diagnosis.
+
+    Run `grounded challenge run DIR` on a machine without the labels.
+    """
+
+
+labels = click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
+
+
+@command(challenge, "make", "challenge", workspace=False)
+@folder
+@click.option(
+    "--kind",
+    type=click.Choice(("single", "double", "none", "withheld")),
+    required=True,
+    help="One effect, two, none, or one that is not in the library.",
+)
+@click.option("--cases", type=click.IntRange(1), required=True, metavar="N", help="How many.")
+@click.option(
+    "--seed", type=click.IntRange(0), required=True, metavar="S", help="Seed of all random draws."
+)
+@click.option(
+    "--systems",
+    default="own",
+    metavar="G1,G2",
+    help="Groups: own, kinked, mujoco (default: own; of several, own makes half of the cases).",
+)
+@labels
+@click.option(
+    "--param-error",
+    type=click.FloatRange(0.0, 0.5),
+    metavar="E",
+    help="Relative error of the model's parameters, 0 to 0.5.",
+)
+def make_cases() -> None:
+    """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
+
+
+@command(challenge, "run", "challenge", workspace=False)
+@folder
+@without
+@flag("--again", help="Also repeat the diagnoses that exist.")
+@parallel("1")
+def run_cases() -> None:
+    """Diagnose the cases of DIR that have no diagnosis yet; an interrupted run resumes."""
+
+
+@command(challenge, "score", "challenge", workspace=False)
+@folder
+@labels
+@parallel("1")
+def score() -> None:
+    """Open the labels, score the diagnoses of DIR and compare with an oracle.
+
+    The oracle knows the effects of each case.
+    """
+
+
+@command(cli, "explain", workspace=False)
+@click.argument("name", metavar="[CODE|EFFECT]", required=False, default="")
+def explain() -> None:
+    """Say what the code of a finding, or an effect, means."""
