@@ -33,12 +33,6 @@ def recover(log: str, output: str | None) -> Iterator[Recovery]:
         show(f"  {topic}: {number}" + (f", {lost} lost" if lost else ""))
     if found.unverified:
         show(field("unchecked", count(found.unverified, "message")))
-    if found.format == TRIAL:
-        ran = f" of {found.candidate}" * bool(found.candidate)
-        planned = f" of {found.planned_steps}" if found.planned_steps is not None else ""
-        show(
-            field("trial", f"{found.steps}{planned} steps{ran}{', with a hole' * bool(found.hole)}")
-        )
     show(f"\n{next_line(_next(found))}")
 
 
@@ -49,8 +43,5 @@ def _next(found: Recovery) -> NextCommand:
         return NextCommand("propose")
     if found.format != TRIAL:
         return NextCommand("inspect", (target,))  # which says how it is ingested
-    if found.hole:
-        return NextCommand("run", (found.candidate,) if found.candidate else ())
-    short = found.planned_steps is None or (found.steps or 0) < found.planned_steps
-    as_data = found.candidate and short and not found.complete
-    return NextCommand("ingest", ("--data", target) if as_data else (target,))
+    whole = all(one.facts.get("index") for one in found.findings)
+    return NextCommand("ingest", (target,) if whole else ("--data", target))

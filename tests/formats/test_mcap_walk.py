@@ -9,17 +9,14 @@ import tarfile
 import zlib
 from typing import Any
 
-import numpy as np
 import pytest
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
 
 from facts import holding
 from grounded.errors import GroundedError
-from grounded_trials.formats import mcap_walk
 from grounded_trials.formats.mcap_records import (
     Attachment,
-    BadRecord,
     Channel,
     End,
     Header,
@@ -204,42 +201,3 @@ def test_a_chunk_with_a_flipped_bit_is_refused() -> None:
     with pytest.raises(DamagedFile, match=holding("chunk", "checksum")) as refused:
         plain(bytes(source))
     assert refused.value.offset > 0
-
-
-def followed_one_by_one(buffer: bytes) -> tuple[list[int], int]:
-    positions, pos = list[int](), 0
-    while len(buffer) - pos >= 9 and len(positions) < mcap_walk.BATCH_MESSAGES:
-        opcode, length = struct.unpack_from("<BQ", buffer, pos)
-        if opcode != mcap_walk.MESSAGE or length > len(buffer) - pos - 9:
-            break
-        if length < mcap_walk.MESSAGE_HEADER:
-            raise BadRecord("decode", what="content")
-        positions.append(pos)
-        pos += 9 + length
-    return positions, pos
-
-
-def test_messages_whose_lengths_repeat_are_found_as_if_followed_one_by_one(monkeypatch):
-    """Also where the cycle ends: at another length, another record, a short one, the end."""
-    monkeypatch.setattr(mcap_walk, "BATCH_MESSAGES", 700)
-    rng = np.random.default_rng(0)
-    for _ in range(300):
-        cycle = rng.integers(22, 60, rng.integers(1, 11))
-        lengths = np.resize(cycle, rng.integers(0, 900))
-        opcodes = np.full(len(lengths), mcap_walk.MESSAGE)
-        odd, lost = rng.random((2, len(lengths))) < rng.choice([0.0, 0.002, 0.02])
-        lengths[odd] = rng.choice([5, 22, 40, 10**6], odd.sum())
-        opcodes[lost] = mcap_walk.SCHEMA
-        records = (
-            struct.pack("<BQ", opcode, length) + bytes(min(length, 100))
-            for opcode, length in zip(opcodes.tolist(), lengths.tolist(), strict=True)
-        )
-        data = b"".join([*records, bytes(rng.integers(0, 40))])
-        data = data[: len(data) - rng.integers(0, 50)]
-        try:
-            expected = followed_one_by_one(data)
-        except BadRecord:
-            with pytest.raises(BadRecord):
-                mcap_walk.message_positions(data, 0, len(data))
-            continue
-        assert mcap_walk.message_positions(data, 0, len(data)) == expected

@@ -20,8 +20,6 @@ from mmap import ACCESS_READ, mmap
 from struct import Struct
 from typing import Any, BinaryIO
 
-import numpy as np
-
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.formats.bad import BadRecord
@@ -46,12 +44,7 @@ from grounded_trials.formats.mcap_records import (
 )
 
 Data = bytes | mmap
-BLOCK = 4 * 2**20  # [bytes] of messages in a batch
-SMALL_CHUNK = 2**16  # [bytes] chunks smaller than this are joined ...
-TOGETHER = 2**20  # [bytes] ... up to this size
-BATCH_MESSAGES = 250_000  # messages in a batch
-SAMPLE = 32  # messages in which a cycle of lengths is looked for
-PERIOD = 8  # longest such cycle, in messages
+BLOCK = 4 * 2**20  # [bytes] of messages outside chunks in a batch
 
 PARSED = frozenset((*PARSERS, CHUNK, MESSAGE))
 _NAMES = {MESSAGE: "a message", CHUNK: "a chunk", SCHEMA: "a schema", CHANNEL: "a channel"}
@@ -112,8 +105,6 @@ class _Walk:
         self.summary = 0  # where the summary begins
         self.data_crc: bool | None = None  # None: still in the data section
         self.defined: dict[tuple[type, int], Schema | Channel] = {}
-        self.small: list[bytes] = []  # the contents of small chunks, and the messages in them
-        self.small_size, self.positions = 0, list[int]()
         self.messages = False  # a message, or a chunk of them, has begun
 
     def damaged(
@@ -139,10 +130,8 @@ class _Walk:
             self.messages |= opcode in (CHUNK, MESSAGE)
             self.need(9 + length, _NAMES.get(opcode, f"a record of type {opcode}"))
             if self.data_crc is None and opcode in PARSED:
-                if opcode != CHUNK:
-                    yield from self._together()
                 if opcode == MESSAGE:
-                    yield self._run_of_messages(9 + length)
+                    yield self._sound(self._run_of_messages(9 + length))
                     continue
             elif opcode not in (DATA_END, FOOTER):  # an index, or part of the summary
                 self.pos += 9 + length
@@ -150,7 +139,6 @@ class _Walk:
             at, start = self.pos, self.pos + 9
             content = memoryview(self.data)[start : start + length]
             if opcode == DATA_END and self.data_crc is None:
-                yield from self._together()
                 self._data_end(content)
             elif opcode == FOOTER:
                 self._footer(content)
@@ -175,55 +163,25 @@ class _Walk:
         except BadRecord as error:
             raise self.damaged("record", "message", error.finding.what) from None
         self.pos += stop
-        return self._in_calendar(batch(block, positions))
+        return batch(block, positions)
 
-    def _in_calendar(self, messages: Messages) -> Messages:
-        if len(messages) and messages.log_times.min() < 0:
-            raise self.damaged("time", "a message")
-        return messages
-
-    def _together(self) -> Iterator[Messages]:
-        """Yield the messages of the small chunks collected so far."""
-        if self.positions:
-            yield self._in_calendar(batch(b"".join(self.small), self.positions))
-        self.small, self.small_size, self.positions = [], 0, []
-
-    def _chunk(self, data: bytes) -> Iterator[Record]:
-        if (
-            len(data) >= SMALL_CHUNK
-            or self.small_size > TOGETHER
-            or len(self.positions) > BATCH_MESSAGES
-        ):
-            yield from self._together()
-        if len(data) < SMALL_CHUNK:
-            for part in chunk_parts(data):
-                if isinstance(part, list):
-                    self.positions += [self.small_size + at for at in part]
-                else:
-                    yield self._defined(part)
-            self.small.append(data)
-            self.small_size += len(data)
-            return
-        for record in chunk_records(data):
-            if isinstance(record, Messages):
-                yield self._in_calendar(record)
-            else:
-                yield self._defined(record)
-
-    def _defined(self, record: Record) -> Record:
-        """Return the record; raise an error if its id belongs to another schema or channel."""
+    def _sound(self, record: Record) -> Record:
+        """Return the record; raise an error for a second definition, or a time outside ours."""
         if isinstance(record, Schema | Channel):
             known = self.defined.setdefault((type(record), record.id), record)
             if known != record:
                 raise again(known, record)
+        elif isinstance(record, Messages) and len(record) and record.log_times.min() < 0:
+            raise self.damaged("time", "a message")
         return record
 
     def _data_record(self, opcode: int, content: memoryview, at: int) -> Iterator[Record]:
         try:
             if opcode == CHUNK:
-                yield from self._chunk(chunk_content(content, packed=self.packed)[0])
+                for record in chunk_records(chunk_content(content, packed=self.packed)[0]):
+                    yield self._sound(record)
             elif opcode in PARSERS:
-                yield self._defined(PARSERS[opcode](Fields(content)))
+                yield self._sound(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
             what = _NAMES.get(opcode, f"a record of type {opcode}")
             raise self.damaged("record", what, error.finding.what, at) from None
@@ -262,7 +220,7 @@ def again(known: Schema | Channel, other: Schema | Channel) -> BadRecord:
 
 
 def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | Messages]:
-    """Yield the schemas and channels of a decompressed chunk, and its messages in batches.
+    """Yield the schemas and channels of a decompressed chunk, then its messages.
 
     Args:
         data: the chunk's content.
@@ -271,39 +229,22 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
     Raises:
         BadRecord: if the records do not fit the chunk.
     """
-    positions: list[int] = []
-    for part in chunk_parts(data, cut=cut):
-        if not isinstance(part, list):
-            yield part
-            continue
-        positions += part
-        if len(positions) >= BATCH_MESSAGES:
-            yield batch(data, positions)
-            positions = []
-    yield batch(data, positions)
-
-
-def chunk_parts(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | list[int]]:
-    """Yield the schemas and channels of a chunk, and the positions of the messages between them.
-
-    Arguments and errors are those of `chunk_records`.
-    """
-    pos, end = 0, len(data)
+    positions, pos, end = list[int](), 0, len(data)
     while pos < end:
-        opcode, length = _HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end)
-        if length > end - pos - 9:
+        some, pos = message_positions(data, pos, end)
+        positions += some
+        opcode, length = _HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end - pos)
+        if pos < end and length > end - pos - 9:
             if cut:
                 break
             raise BadRecord("decode", what="content")
-        if opcode == MESSAGE:
-            positions, pos = message_positions(data, pos, end)
-            yield positions
-            continue
         if opcode in (SCHEMA, CHANNEL):
             record = PARSERS[opcode](Fields(data[pos + 9 : pos + 9 + length]))
             assert isinstance(record, Schema | Channel)
             yield record
-        pos += 9 + length
+        if opcode != MESSAGE:
+            pos += 9 + length
+    yield batch(data, positions)
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:
@@ -313,8 +254,8 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
         BadRecord: for a message that is shorter than its header.
     """
     positions: list[int] = []
-    append, unpack, look = positions.append, _HEAD.unpack_from, SAMPLE
-    while end - pos >= 9 and len(positions) < BATCH_MESSAGES:
+    append, unpack = positions.append, _HEAD.unpack_from
+    while end - pos >= 9:
         opcode, length = unpack(buffer, pos)
         if opcode != MESSAGE or length > end - pos - 9:
             break
@@ -322,34 +263,4 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
             raise BadRecord("decode", what="header", at=f"{length} bytes")
         append(pos)
         pos += 9 + length
-        if len(positions) == look:
-            more, pos = _repeated(buffer, positions[-SAMPLE:], pos, end)
-            positions += more
-            look = len(positions) + (SAMPLE if more else 8 * SAMPLE)
-    return positions[:BATCH_MESSAGES], positions[BATCH_MESSAGES] if len(
-        positions
-    ) > BATCH_MESSAGES else pos
-
-
-def _repeated(buffer: bytes, last: list[int], pos: int, end: int) -> tuple[list[int], int]:
-    """Continue `message_positions` as long as the lengths of the last messages repeat.
-
-    A log of a few topics at one rate does so nearly to its end, and comparing headers with those
-    that are expected takes a tenth of the time of following them one by one.
-    """
-    sizes = np.diff([*last, pos])
-    cycles = (p for p in range(1, PERIOD + 1) if (sizes[p:] == sizes[:-p]).all())
-    period = next(cycles, 0)
-    if not period:
-        return [], pos
-    cycle = sizes[-period:]
-    count = min((end - pos) // int(cycle.sum()), BATCH_MESSAGES // period) * period
-    if count < SAMPLE:
-        return [], pos
-    expected = np.tile(cycle, count // period)
-    starts = pos + np.cumsum(expected) - expected
-    anywhere = np.ndarray((len(buffer) - 8,), "<u8", buffer, offset=1, strides=(1,))
-    right = np.frombuffer(buffer, np.uint8)[starts] == MESSAGE
-    right &= anywhere[starts] == (expected - 9).astype("<u8")
-    good = count if right.all() else int(right.argmin())
-    return starts[:good].tolist(), pos + int(expected[:good].sum())
+    return positions, pos
