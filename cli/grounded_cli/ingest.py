@@ -62,8 +62,6 @@ def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRu
     tell_proposed(done.proposed)
     if done.exported is None:
         show(f"\n{next_line(done.proposed.then)}")
-    if done.removed:
-        show(field("removed", ", ".join(map(str, done.removed)), "  "))
     if done.exported is not None:
         files = filter(None, (done.exported.file, done.exported.runner))
         show(field("files", ", ".join(map(str, files)), "  "))

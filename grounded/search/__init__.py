@@ -4,10 +4,9 @@ Read `improve.py` first: it makes one proposal of the paper's loop.
 
 ask_tell      the loop around the proposals
 standing      the state of the search, and why it ended
-certainty     how certain an improvement is, from `scatter`, the noise of utilities
+certainty     which candidates improved, by `difference` (is one better, how sure) and `noise`
 first_policy  the first policy: DDP from many starts, the first of them from `first_guess`
 making        builds a `candidate`: from a step, gentler gains, or the plan of a changed model
-original      steps with the model as it was, if runs that lost contradict adopted effects
 planner       the model used for planning, with adopted effects
 safety        checks a candidate before it is handed out
 pictures      figures of the search

@@ -16,7 +16,7 @@ from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.search.starts import Starts
+    from grounded.search.difference import Starts
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
@@ -30,8 +30,6 @@ BY_STEP: Way = "slopes by step"
 Slopes = Literal[
     "",  # the model's own
     "corrected",  # from the mispredictions of earlier trials, see `mispredictions`
-    "original",  # those of the model without adopted effects, see `original`
-    "original, corrected",
 ]
 
 # fraction of the best cost below which a doubtful gain is no reason to continue
@@ -131,14 +129,9 @@ class Candidate(Result):
         return self.predicted_utility - best.utility
 
     @property
-    def of_original(self) -> bool:
-        """Whether it was planned without the adopted effects."""
-        return self.slopes in ("original", "original, corrected")
-
-    @property
     def of_corrected(self) -> bool:
         """Whether it was planned with derivatives corrected by laws of the whole run."""
-        return self.slopes in ("corrected", "original, corrected") and self.way != BY_STEP
+        return self.slopes == "corrected" and self.way != BY_STEP
 
     def summary(self) -> str:
         """Return the id, the step and the predicted utility."""
@@ -181,14 +174,12 @@ class Tried(Result):
     accepted: bool | None  # None: undecided, trials are missing
     in_doubt: bool = False  # undecided because one of the two is to be run again
     to_settle: str = ""  # id of the candidate whose next run is to settle the doubt
-    pieces: Array | None = None  # (runs, PIECES) parts of the utilities, see `scatter`; of repeats
+    pieces: Array | None = None  # (runs, PIECES) parts of the utilities of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
-    noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `NoiseSoFar.before`
-    deviation: float = float("nan")  # standard deviation of a single run, from repeats (`scatter`)
-    repeats: int = 0  # runs beyond the first of each candidate on which that rests
-    placed: bool = False  # whether where runs began is most of what they scatter by
+    noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `known_noise`
+    deviation: float = float("nan")  # standard deviation of a single run, from repeats (`Repeats`)
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
-    unsure: bool = False  # nothing is repeated, and runs may differ by as much as it gained
+    unsure: bool = False  # runs may differ by as much as it gained (`Difference.sure`)
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
     starts: Starts | None = None  # what the start states of its runs cost, by the model
@@ -224,10 +215,9 @@ class Tried(Result):
         """Whether its runs scatter by about as much as they cost.
 
         Noise in many samples scatters far less than it costs. So something else decides how a run
-        goes, such as where dry friction holds, and another policy may well be steadier; where runs
-        scatter by where they began, none is.
+        goes, such as where dry friction holds, and another policy may well be steadier.
         """
-        return bool(self.deviation > UNSTEADY * abs(self.utility)) and not self.placed
+        return bool(self.deviation > UNSTEADY * abs(self.utility))
 
     @cached_property
     def standard_error(self) -> float:
@@ -266,8 +256,7 @@ class Tried(Result):
 
         That of a candidate whose last run is to be discarded is "ended early" or "in doubt".
 
-        It is "maybe better" if its runs were better, but by so little that the scatter of repeats
-        may explain it or, while none tells that, the scatter that runs may have (`clear`).
+        It is "maybe better" if its runs were better, but by no more than they may scatter.
 
         Args:
             last: whether it is the latest candidate; an earlier one without a trial gets "no
@@ -283,7 +272,7 @@ class Tried(Result):
             return "crashed" if self.crashed else "no better"
         if not self.candidate.base:
             return "first"
-        return "maybe better" if self.probability < IMPROVED or self.unsure else "better"
+        return "maybe better" if self.unsure else "better"
 
     def summary(self) -> str:
         """Return the id, the utility and the verdict."""

@@ -5,27 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import accumulate, pairwise
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.difference import LUCK, Difference
-from grounded.search.scatter import (
-    NoiseSoFar,
-    Repeats,
-    StartShare,
-    by_pieces,
-    noise_cost,
-    noise_missed,
-    with_errors,
-)
+from grounded.search.difference import LUCK, Difference, Repeats, by_pieces
+from grounded.search.noise import known_noise, noise_cost, noise_missed, sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial, scattered
 
 if TYPE_CHECKING:
-    from grounded.search.starts import Starts
+    from grounded.search.difference import Starts
     from grounded.search.step.step_size import SearchOptions
 
 
@@ -47,16 +39,15 @@ def judged(
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
     exact = False  # whether the system has repeated itself to the last bit
-    share = StartShare()
-    ids = {c.id for c in candidates}
     known = {trial.id for trial in trials}
-    spent = sum(t.candidate in ids for t in trials) >= options.max_trials
-    by_name: dict[str, list[Trial]] = {}
+    runs: dict[str, list[Trial]] = {one.id: [] for one in candidates}
     for trial in trials:
-        by_name.setdefault(trial.candidate, []).append(trial.whole(task.horizon))
-    agree = not scattered([trial for one in ids for trial in by_name.get(one, ())])
+        if trial.candidate in runs:
+            runs[trial.candidate].append(trial.whole(task.horizon))
+    every = [trial for some in runs.values() for trial in some]
+    spent, agree = len(every) >= options.max_trials, not scattered(every)
     for candidate in candidates:
-        own = tuple(by_name.get(candidate.id, ()))
+        own = tuple(runs[candidate.id])
         utilities = tuple(task.utility(t) for t in own)
         gone = tuple(one for one in candidate.seen if one not in known)
         failed = any(u == -np.inf for u in utilities)
@@ -67,14 +58,16 @@ def judged(
             continue
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
         tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone, starts=starts)
-        share.add(tried)
-        tried = replace(tried, placed=share.most)
         better = incumbent is None or tried.utility > incumbent.utility
         if better and not failed:
             tried = replace(tried, accepted=True)
             iteration += incumbent is not None
             incumbent, losses = tried, 0
-            history = [_settled(one) for one in history]
+            # a loss that was in doubt is one: this candidate beat both runs
+            history = [
+                replace(t, accepted=False, in_doubt=False, to_settle="") if t.in_doubt else t
+                for t in history
+            ]
         elif incumbent is not None and (candidate.base, candidate.model) == (
             incumbent.candidate.id,
             model,
@@ -90,37 +83,34 @@ def judged(
                 name = again.candidate.id if again else ""
                 tried = replace(tried, accepted=None, in_doubt=True, to_settle=name)
         history.append(tried)
-    best_one = incumbent and incumbent.candidate
-    noises = NoiseSoFar(trials, task.model.n)
-    since = [*accumulate((noises.first(c.id) for c in reversed(candidates)), min)][::-1]
-    pairs = zip(history, since, strict=True)
-    whole = [_with_noise(task, tried, noises, first) for tried, first in pairs]
-    pool = Repeats(whole)
-    told = with_chances(with_errors(whole, pool), pool)
-    best = next((t for t in told if t.candidate is best_one), None)
+    told = _told(task, history, trials)
+    best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
     return told, best, iteration
 
 
-def _with_noise(task: Task, tried: Tried, noises: NoiseSoFar, since: int) -> Tried:
-    """Return the candidate with the mean cost of the noise in its logs, and what was promised.
+def _told(task: Task, history: Sequence[Tried], trials: Sequence[Trial]) -> tuple[Tried, ...]:
+    """Return the candidates with the noise in their logs, their scatter, and how sure gains are."""
+    pool, now, n = Repeats(history), sensor_noise(trials, task.model.n), task.model.n
+    found, best = list[Tried](), None
+    for tried in history:
+        made = tried.candidate
+        tried = replace(
+            tried,
+            noise_missed=noise_missed(task, made, known_noise(trials, made, n)),
+            noise_cost=noise_cost(task, made.policy, now) if tried.trials else 0.0,
+            deviation=math.sqrt(pool.near(tried.utility).variance),
+        )
+        found.append(with_chance(tried, best, history, pool))
+        best = tried if tried.accepted else best
+    return tuple(found)
 
-    The promise is made with the noise known before its first run, and stays as it is.
 
-    Args:
-        task: its reward judges the logs.
-        tried: the candidate.
-        noises: the noise of the sensors over time.
-        since: place of the first trial of the candidate or of a later one.
-    """
-    made = tried.candidate
-    missed = noise_missed(task, made, noises.before(since, made.seen))
-    cost = noise_cost(task, made.policy, noises.now) if tried.trials else 0.0
-    return replace(tried, noise_cost=cost, noise_missed=missed)
-
-
-def _settled(tried: Tried) -> Tried:
-    """Return a candidate whose loss was in doubt as one that lost: a later one beat both runs."""
-    return replace(tried, accepted=False, in_doubt=False, to_settle="") if tried.in_doubt else tried
+def with_chance(tried: Tried, best: Tried | None, history: Sequence[Tried], pool: Repeats) -> Tried:
+    """Return a candidate; an improvement on the best before it gets the probability that it is."""
+    if not tried.accepted or best is None:
+        return tried
+    gained = Difference(best, tried, history, pool)
+    return replace(tried, probability=gained.probability, unsure=not gained.sure)
 
 
 def repeated_exactly(trials: Sequence[Trial]) -> bool:
@@ -158,16 +148,3 @@ def to_settle(incumbent: Tried, loser: Tried, most: int, once: int = 2) -> Tried
         either, cost = [(loser, min(once, most)), (incumbent, most)], loser.starts.cost
         either.sort(key=lambda one: -abs(cost(one[0])))
     return next((one for one, runs in either if len(one.trials) < runs), None)
-
-
-def with_chances(history: Sequence[Tried], pool: Repeats) -> tuple[Tried, ...]:
-    """Return the candidates; every improvement gets the probability that it is one."""
-    found, best = list(history), None
-    for k, tried in enumerate(history):
-        if tried.accepted and best is not None:
-            gained = Difference(best, tried, history, pool)
-            sure = gained.probability
-            unsure = math.isnan(sure) and not gained.clear
-            found[k] = replace(tried, probability=sure, unsure=unsure)
-        best = tried if tried.accepted else best
-    return tuple(found)

@@ -1,39 +1,198 @@
 """Difference: is one candidate better than another, by how much, and how sure is that?
 
 Every part that compares two utilities asks it: the verdicts and the end of the search, `status`,
-`propose`, the report and the page. Single runs scatter (`scatter`), and they begin at different
-start states, whose part of a difference the models tell (`starts`). Student's t-test with the
-scatter of all repeats of similar utility gives the probability. While nothing was repeated, costs
-are taken to scatter as chi-squared with eight degrees of freedom.
+`propose`, the report and the page. Single runs scatter, and they begin at different start states,
+whose part of a difference the planning model tells (`Starts`). Student's t-test with the scatter of
+all repeats of similar utility gives the probability. While nothing was repeated, costs are taken to
+scatter as chi-squared with eight degrees of freedom.
+
+Two runs may have nearly equal utilities by chance, and few candidates are run more than twice. So
+the variance of a run is estimated from pooled data (`Repeats`):
+
+    over candidates   all repeated candidates of about the same cost: the scatter of a poor policy
+                      says nothing about that of a good one
+    within runs       a utility is the sum over PIECES parts of the run. Two sums may agree by
+                      chance, but hardly all of their parts. With A the variance of the utilities
+                      and B the sum of the variances of the parts: (nu A + mu B) / (nu + mu)
+
+nu is the number of repeats. mu is the additional information of the parts: the effective degrees of
+freedom of B (Satterthwaite, "An approximate distribution of estimates of variance components",
+Biometrics Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repeats outweigh the
+assumption that the parts are independent. This is a conjugate prior on the variance (Gelman et al.,
+*Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
+from grounded.frozen import Array
+from grounded.places import true_values
+from grounded.policy import Policy
 from grounded.search.candidate import DOUBTFUL_GAIN, IMPROVED, START_SHARE, Candidate, Tried
-from grounded.search.scatter import Repeats, Scatter
+from grounded.search.noise import beyond_noise
+from grounded.search.planner import Planner, predicted
+from grounded.task import Task
+from grounded.trial import Trial
 
+PIECES = 4  # parts of a run
+LARGEST_COST_RATIO = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability IMPROVED, 0.95
 COST_RATIO = 3.44  # ratio of two costs that is no scatter: F(8, 8) exceeds it in 1 of 20 cases
-FEW_REPEATS = 8  # repeats below which a scatter may be off by half, so that their number is told
 
 
-class Doubt(StrEnum):
-    """What may explain that a candidate is ahead of another."""
+# --- how much runs scatter ------------------------------------------------------------------------
 
-    NONE = ""
-    SCATTER = "scatter"  # that of repeats
-    STARTS = "starts"  # where the runs began
-    UNKNOWN = "unknown"  # nothing was repeated, so how much runs scatter is not known
+
+@dataclass(frozen=True)
+class Scatter:
+    """Variance of a single run's utility, and its degrees of freedom; NaN and 0 if not known."""
+
+    variance: float = math.nan
+    freedom: float = 0.0
+
+    def error(self, runs: int) -> float:
+        """Return the standard error of the mean of `runs` runs."""
+        return math.sqrt(self.variance / runs)
+
+
+def by_pieces(task: Task, trials: Sequence[Trial]) -> Array:
+    """Return the utility of each part of each run, (runs, PIECES); rows sum to the utilities."""
+    worth = [task.rewards(trial) for trial in trials]
+    return np.array([[part.sum() for part in np.array_split(r, PIECES)] for r in worth])
+
+
+class Repeats:
+    """The candidates that were run repeatedly, with their costs and sums of squares."""
+
+    def __init__(self, history: Iterable[Tried]) -> None:
+        rows = [_sums(t) for t in history if len(t.utilities) > 1 and math.isfinite(t.utility)]
+        if any(row[2:].any() for row in rows):  # then identical runs must be copies
+            rows = [row for row in rows if row[2:].any()]
+        self.rows = np.array(rows).reshape(len(rows), 3 + PIECES)
+
+    def near(self, utility: float) -> Scatter:
+        """Return the scatter of runs of about this utility; none if all repeats agree exactly."""
+        cost, each = abs(utility), np.abs(self.rows[:, 0])
+        exact = not self.rows[:, 2:].any()  # then no run scatters, at whatever utility
+        some = self.rows[
+            exact | ((each <= LARGEST_COST_RATIO * cost) & (cost <= LARGEST_COST_RATIO * each))
+        ]
+        nu, total = float(some[:, 1].sum()), float(some[:, 2].sum())
+        parts = some[:, 3:].sum(axis=0)
+        if not (nu and math.isfinite(total + parts.sum())):
+            return Scatter()
+        share = parts / (parts.sum() or 1.0)
+        added = min(nu / float((share**2).sum() or 1.0) - nu, PIECES - 1.0)
+        variance = (total + added * float(parts.sum()) / nu) / (nu + added)
+        return Scatter(variance, nu + added)
+
+
+def _sums(tried: Tried) -> Array:
+    """Return the utility, degrees of freedom, sum of squares, and sums of squares of the parts."""
+    parts, total = np.zeros(PIECES), 0.0
+    if len(set(tried.utilities)) > 1:  # else exactly 0, which a rounded mean may miss
+        with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
+            if tried.pieces is not None:
+                parts = ((tried.pieces - tried.pieces.mean(axis=0)) ** 2).sum(axis=0)
+            total = float(np.var(tried.utilities)) * len(tried.utilities)
+    return np.array([tried.utility, len(tried.utilities) - 1.0, total, *parts])
+
+
+# --- what start states cost -----------------------------------------------------------------------
+
+
+class Starts:
+    """What the starts of runs cost by the planning model, each run predicted only once.
+
+    A run that began off s_0 has another utility than its policy has from s_0. The model runs the
+    policy from both; the difference is what the start cost.
+
+    Args:
+        planner: has the model that predicts the runs.
+    """
+
+    def __init__(self, planner: Planner) -> None:
+        self.planner, self._known = planner, dict[tuple[str, int], float]()
+
+    def owed(self, one: Tried, other: Tried) -> float:
+        """Return the part of the difference of two mean utilities that is due to the starts.
+
+        It is 0 if all runs began alike, whatever their common start costs, and NaN if the model
+        can't tell it.
+        """
+        starts = np.array([t.began for tried in (one, other) for t in tried.trials])
+        middle, model = starts.mean(axis=0), self.planner.task.model
+        with np.errstate(all="ignore"):  # of diverged runs
+            apart = any(
+                beyond_noise(
+                    (trial,),
+                    model.difference(trial.began, middle)[None],
+                    tried.candidate.predicted_states[0],
+                    tried.candidate.predicted_states,
+                ).any()
+                for tried in (one, other)
+                for trial in tried.trials
+            )
+        return self.cost(other) - self.cost(one) if apart else 0.0
+
+    def cost(self, tried: Tried) -> float:
+        """Return what the starts of a candidate's runs cost on average; < 0 for lucky ones.
+
+        It is NaN if a run fails in the model, or if a start would cost more than the whole run did.
+        """
+        return float(np.mean([self._of(tried, k) for k in range(len(tried.trials))]))
+
+    def _of(self, tried: Tried, k: int) -> float:
+        key = (tried.candidate.id, k)
+        if key not in self._known:
+            task, began = self.planner.task, tried.trials[k].began
+            off = task.model.difference(began, task.start)
+            self._known[key] = -worth_of_start(self.planner, tried.candidate.policy, off)
+        cost = self._known[key]
+        return cost if math.isfinite(cost) and cost <= -tried.utilities[k] else math.nan
+
+
+def worth_of_start(planner: Planner, policy: Policy, off: Array) -> float:
+    """Return by how much a start that is off s_0 by `off` (n,) changes the utility in the model.
+
+    True values behind late or filtered logs are off by as much: else the log would soon show the
+    robot at s_0. NaN if the model fails from s_0, -inf if it fails from there only.
+    """
+    problem = planner.feeding_back((policy,)).plan.problem(exact=True)
+    moved, names, n = problem.start.copy(), planner.plan.model.state_names, len(off)
+    moved[:n] += off
+    for memory, logged in true_values(names, names[n:]).items():
+        moved[memory] += off[logged]
+    with np.errstate(all="ignore"):
+        from_there, from_s_0 = (
+            predicted(replace(problem, start=start), policy).utility
+            for start in (moved, problem.start)
+        )
+    return float(from_there - from_s_0)
+
+
+def missed_by_start(tried: Tried) -> float:
+    """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
+
+    A part of what they missed its prediction by, which begins at [task] start. 0 if the model can't
+    tell it, too.
+    """
+    if tried.starts is None or not tried.trials or not math.isfinite(tried.utility):
+        return 0.0
+    cost = tried.starts.cost(tried)
+    small = abs(cost) < START_SHARE * abs(tried.promised - tried.utility)
+    return 0.0 if small or not math.isfinite(cost) else cost
+
+
+# --- the comparison -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,21 +221,6 @@ class Difference:
         """The part of the gain that is not due to different start states."""
         return self.gain - self.owed
 
-    @cached_property
-    def repeats(self) -> Repeats:
-        """All repeats in the history."""
-        return self.pool or Repeats(self.history)
-
-    @cached_property
-    def scatter(self) -> Scatter:
-        """The scatter of runs of about the later one's utility."""
-        return self.repeats.near(self.after.utility)
-
-    @property
-    def few(self) -> int | None:
-        """On how few repeats the scatter rests; None if they are enough, or there are none."""
-        return few(self.scatter.repeats)
-
     @property
     def known(self) -> bool:
         """Whether repeats tell the error."""
@@ -86,17 +230,6 @@ class Difference:
     def error(self) -> float:
         """Standard error of the gain; NaN if it is not known."""
         return self._spread[0]
-
-    @property
-    def likely_error(self) -> float:
-        """The standard error if `before` scatters as `after` does, since a poor policy says little.
-
-        While nothing was repeated, by half of the cost, as chi-squared with eight degrees of
-        freedom does.
-        """
-        near, cost = self.scatter, abs(self.after.utility)
-        runs = 1 / len(self.before.utilities) + 1 / len(self.after.utilities)
-        return math.sqrt(runs * near.variance) if near.known else 0.5 * cost * math.sqrt(runs)
 
     @property
     def freedom(self) -> float:
@@ -109,17 +242,32 @@ class Difference:
 
         If no repeats are near the earlier candidate, the scatter of the later one is used for both.
         """
-        later, runs = self.scatter, (len(self.before.utilities), len(self.after.utilities))
-        if not (later.known and all(runs)):
+        pool, runs = self._pool, (len(self.before.utilities), len(self.after.utilities))
+        later, earlier = (pool.near(one.utility) for one in (self.after, self.before))
+        if not (later.freedom and all(runs)):
             return math.nan, 0.0
-        earlier = self.repeats.near(self.before.utility)
-        earlier = earlier if earlier.known else later
+        earlier = earlier if earlier.freedom else later
         squares = earlier.error(runs[0]) ** 2, later.error(runs[1]) ** 2
         error = math.sqrt(sum(squares))
         if earlier == later or not error:
             return error, later.freedom
         parts = squares[0] ** 2 / earlier.freedom + squares[1] ** 2 / later.freedom
         return error, error**4 / parts
+
+    @cached_property
+    def _pool(self) -> Repeats:
+        return self.pool or Repeats(self.history)
+
+    @property
+    def likely_error(self) -> float:
+        """The standard error if `before` scatters as `after` does, since a poor policy says little.
+
+        While nothing was repeated, by half of the cost, as chi-squared with eight degrees of
+        freedom does.
+        """
+        near, cost = self._pool.near(self.after.utility), abs(self.after.utility)
+        runs = 1 / len(self.before.utilities) + 1 / len(self.after.utilities)
+        return math.sqrt(runs * near.variance) if near.freedom else 0.5 * cost * math.sqrt(runs)
 
     @cached_property
     def of_start(self) -> float:
@@ -134,50 +282,31 @@ class Difference:
         return start if abs(start) > START_SHARE * abs(self.gain) and math.isfinite(start) else 0.0
 
     @property
-    def apart(self) -> bool:
-        """Whether they began apart, and no model tells what that is worth."""
-        return math.isnan(self.of_start)
-
-    @property
     def probability(self) -> float:
         """That the later one is better, start states apart; NaN if repeats or models can't tell."""
         if not math.isfinite(self.before.utility):  # it failed
             return 1.0
-        own = self.own
-        if not self.freedom or (self.error and self.apart):
+        if not self.known or (self.error and math.isnan(self.of_start)):
             return math.nan
-        return student(own / self.error, self.freedom) if self.error else float(own > 0)
+        return student(self.own / self.error, self.freedom) if self.error else float(self.own > 0)
 
     @property
-    def clear(self) -> bool:
-        """Whether the gain is one although no repeat tells how much runs scatter."""
-        if not math.isfinite(self.before.utility):  # it failed
-            return True
-        return self.before.utility < COST_RATIO * (self.after.utility - self.owed)
+    def sure(self) -> bool:
+        """Whether the gain is one with probability IMPROVED.
 
-    @property
-    def doubt(self) -> Doubt:
-        """What may explain the gain: none if it is one with probability IMPROVED, or `clear`."""
+        If no repeat tells how much runs scatter: whether it is more than costs usually scatter by.
+        """
         sure = self.probability
-        if sure < IMPROVED:
-            by_scatter = student(self.gain / self.error, self.freedom) if self.error else 0.0
-            return Doubt.STARTS if by_scatter >= IMPROVED else Doubt.SCATTER
-        if math.isnan(sure) and not self.clear:
-            whole = self.before.utility < COST_RATIO * self.after.utility
-            return Doubt.STARTS if whole else Doubt.UNKNOWN
-        return Doubt.NONE
-
-    @property
-    def open(self) -> bool:
-        """Whether less than its error is left of the gain without the part of the start states."""
-        return not self.own > SHOWN * (self.error if self.freedom else 0.0)
+        if math.isnan(sure):
+            return self.before.utility < COST_RATIO * (self.after.utility - self.owed)
+        return sure >= IMPROVED
 
     @property
     def lead(self) -> Finding:
-        """The share of the cost by which `after` is ahead, or what may explain that it is."""
+        """The share of the cost by which `after` is ahead, or that scatter may explain that."""
         after, before = self.after.candidate.id, self.before.candidate.id
-        if self.gain > 0 and (doubt := self.doubt):
-            return found("search.lead", after, doubt=doubt.value, before=before)
+        if self.gain > 0 and not self.sure:
+            return found("search.lead", after, before=before)
         cost = abs(self.before.utility)
         return found(
             "search.better",
@@ -186,13 +315,12 @@ class Difference:
             share=abs(self.gain) / cost,
             better=int(self.gain > 0),
             error=self.error / cost,
-            few=self.few if self.error else None,
             start=abs(self.owed) / cost,
         )
 
     def to_finding(self) -> Finding:
         """Return the gain with how certain it is. It asks for no run: that is decided elsewhere."""
-        told = self.known and not self.owed and not self.apart and self.error > 0
+        told = self.known and not self.owed and not math.isnan(self.of_start) and self.error > 0
         return found(
             "search.gain",
             self.after.candidate.id,
@@ -200,11 +328,9 @@ class Difference:
             before=self.before.candidate.id,
             gain=Quantity(self.gain, "1", self.error),
             probability=self.probability if told else None,
-            few=self.few if told else None,
             start=self.owed or None,
             own=self.own,
-            open=int(bool(self.owed) and self.open),
-            apart=int(self.apart and self.error > 0),
+            apart=int(math.isnan(self.of_start) and self.error > 0),
             single=int(not self.known and not self.owed),
             exact=int(self.known and self.error == 0 and not self.owed),
         )
@@ -214,11 +340,6 @@ def last_gain(history: Sequence[Tried]) -> Difference | None:
     """Return the last accepted improvement; None before there is one."""
     accepted = [t for t in history if t.accepted]
     return Difference(accepted[-2], accepted[-1], history) if len(accepted) > 1 else None
-
-
-def few(repeats: int) -> int | None:
-    """Return on how many repeats a scatter rests if it may be far off; else None."""
-    return repeats if 0 < repeats < FEW_REPEATS else None
 
 
 def one_trial_error(best: Tried, repeats: int = 1) -> float:
@@ -247,23 +368,9 @@ def in_question(made: Candidate, best: Tried, repeats: int = 1) -> Finding | Non
         best=own,
         gain=gain,
         luck=luck if luck >= error else None,
-        few=few(best.repeats) if luck >= error else None,
         error=error if error > luck else None,
         share=gain / cost if little else None,
     )
-
-
-def missed_by_start(tried: Tried) -> float:
-    """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
-
-    A part of what they missed its prediction by, which begins at [task] start. 0 if the model can't
-    tell it, too.
-    """
-    if tried.starts is None or not tried.trials or not math.isfinite(tried.utility):
-        return 0.0
-    cost = tried.starts.cost(tried)
-    small = abs(cost) < START_SHARE * abs(tried.promised - tried.utility)
-    return 0.0 if small or not math.isfinite(cost) else cost
 
 
 def student(x: float, freedom: float) -> float:

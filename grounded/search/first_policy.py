@@ -20,9 +20,6 @@ iteration promises less than ROUGH of its cost or gains less than ROUGH^2 of wha
 costs (an error of a thousandth of the way). The start that costs least is first, and a rival gets
 as many iterations as that took. Slopes are differences, which a joint that sticks or a contact
 makes wrong: smaller promises are often not kept, and such a search would go on for as long again.
-
-A plan is made in a model with smoothed kinks and run in one without smoothing. If its run there
-costs much more, it is re-solved while the smoothing is reduced (`_sharpened`).
 """
 
 from __future__ import annotations
@@ -58,8 +55,6 @@ WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # factors on the speed a dry fri
 FOLLOWED = 200  # iterations of DDP for each of them
 ROUGH = 1e-3  # relative gain of an iteration below which a simulator's plan is done
 DAMPED = 4  # halvings of a simulator's damped step: more damping costs it less than more runs
-BLUNT = 1.2  # cost ratio, unsmoothed over smoothed, above which a plan is re-solved
-SHARPER = (0.5, 0.25, 0.1, 0.03, 0.01, 0.0)  # factors on the smoothing width
 FEWEST = 10  # a rival is not started with fewer iterations than this
 CHECKED = 4  # steps of the plan at which the model's code is evaluated again to check it
 HOPELESS, HOPELESS_SLOW = 1e6, 1e3  # factor of the best cost above which a start is dropped
@@ -111,40 +106,10 @@ def first_policy(
     if best.status == "max iterations" and len(best.trace) < ITERATIONS:
         more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
         best = replace(more, trace=(*best.trace, *more.trace))
-    best = _sharpened(task, problem, best, tick)
     model, some = task.model, np.linspace(0, len(best.u) - 1, CHECKED).astype(int)
     if np.isfinite(best.z).all():
         model.system.check(best.z[some, : model.n], best.u[some], model.values, task.dt)
     return task.policy(best.u, best.K, best.z[:-1]), best
-
-
-def _sharpened(task: Task, problem: Problem, best: ddp.Solution, tick: Tick | None) -> ddp.Solution:
-    """Return the plan with the lowest total cost over all degrees of smoothing, down to none.
-
-    A plan may hold only with smoothed friction (an arm with dry friction and a delay kept to its
-    plan within 4 mrad, but spun without smoothing), or only with the exact kink; both are fragile.
-    Constant inputs are one of the starts, so that no plan costs more than those.
-    """
-    exact = task.problem(exact=True)
-    if not problem.smoothing or _cost(exact, best) <= BLUNT * best.cost:
-        return best
-    blends = [replace(problem, smoothing=share * problem.smoothing) for share in (1.0, *SHARPER)]
-    size = problem.horizon * (problem.nz + task.model.m) ** 2
-    most = int(np.clip(WORK / (len(blends) * size), FEWEST, ITERATIONS))
-    last, found = best, [(best, problem)]
-    for sharper in blends[1:]:
-        last = finished(sharper, last.u, last.K, last.z[:-1], most=most, tick=tick)
-        found.append((last, sharper))
-    found.append((finished(exact, next(_rivals(task)), most=most, tick=tick), exact))
-    plan, made = min(found, key=lambda each: sum(_cost(blend, each[0]) for blend in blends))
-    if plan.status != "max iterations":
-        return plan
-    return finished(made, plan.u, plan.K, plan.z[:-1], tick=tick)
-
-
-def _cost(problem: Problem, plan: ddp.Solution) -> float:
-    """Return the cost of a plan's run with its feedback; infinite if it diverges."""
-    return _start_cost(problem, (plan.u, plan.K, plan.z[:-1]))
 
 
 def cautious(task: Task, caution: int) -> Task:

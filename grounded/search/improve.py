@@ -34,9 +34,8 @@ from grounded.errors import GroundedError
 from grounded.findings import found
 from grounded.model import Model
 from grounded.search.candidate import BY_STEP, Candidate, Tried
-from grounded.search.difference import few, one_trial_error
+from grounded.search.difference import one_trial_error
 from grounded.search.making import About, Maker
-from grounded.search.original import trusted
 from grounded.search.planner import Planner
 from grounded.search.standing import (
     DIAGNOSE,
@@ -160,34 +159,31 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
 
     # Steps 4 and 5, and the plan of a model that was changed since the best trial.
     about = About(make, incumbent, options)
-    by, proposal = _step(about)
+    proposal = _step(about)
     proposal = about.own_plan(proposal) or proposal
 
     # Step 7: no step is worth a trial.
     if proposal is None:
-        return Proposal(_ended(make, incumbent, by, options), None, False)
+        return Proposal(_ended(make, incumbent, about, options), None, False)
     if proposal.candidate is not None:
         noise = _below_noise(make, incumbent, proposal.candidate, options)
         return proposal if noise is None else Proposal(noise, None, False)
     return proposal
 
 
-def _step(about: About) -> tuple[About, Proposal | None]:
-    """Return the due step, and the grounded model that makes it."""
-    make, base, by, due = about.make, about.incumbent.candidate, trusted(about), about.make.now.step
+def _step(about: About) -> Proposal | None:
+    """Return the due step, by the derivatives that promise most."""
+    base, due = about.incumbent.candidate, about.make.now.step
     assert due is not None
 
     # Steps of derivatives that hold for each step of the run by itself go on.
-    by_step = _by_step(by)
-    if by_step is not None and base.way == BY_STEP and base.model == make.fingerprint:
-        return by, by_step
+    by_step = _by_step(about)
+    if by_step is not None and base.way == BY_STEP and base.model == about.make.fingerprint:
+        return by_step
 
-    # Else they make the step if that promises more. One without the adopted effects must not ruin
-    # the run with them.
-    made = by.step_from(due)
-    if by is not about and made and made.candidate and about.ruined_by(made.candidate):
-        by, made = about, about.step_from(due)
-    return by, made if _promise(made) >= _promise(by_step) else by_step
+    # Else they make the step if that promises more.
+    made = about.step_from(due)
+    return made if _promise(made) >= _promise(by_step) else by_step
 
 
 def _promise(made: Proposal | None) -> float:
@@ -201,7 +197,7 @@ def _by_step(about: About) -> Proposal | None:
     step = options.due(make.now.history, about.incumbent, make.fingerprint, BY_STEP)
     if step is None:
         return None
-    stepping = About(make, about.incumbent, options, BY_STEP, about.original)
+    stepping = About(make, about.incumbent, options, BY_STEP)
     made = stepping.step_from(step) if stepping.corrected else None
     return made if made and made.candidate else None
 
@@ -236,7 +232,6 @@ def _below_noise(
         lost=_steps_lost(make, own),
         gain=gain if gain > 0 else None,
         error=error,
-        few=few(best.repeats) if gain > 0 else None,
     )
     return let_down(ended(make.now, Ending.BELOW_NOISE, less), make.fingerprint)
 

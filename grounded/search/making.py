@@ -17,9 +17,9 @@ from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 from grounded.search.feedback.margin import steadied
 from grounded.search.feedback.oscillation import between_limits, limit_cycle
 from grounded.search.feedback.sample_age import planned_age, run_ages
+from grounded.search.noise import beyond_noise
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
-from grounded.search.scatter import beyond_noise
 from grounded.search.standing import Ending, Proposal, Standing, ended, wild
 from grounded.search.step.directions import base_columns, direction
 from grounded.search.step.step_size import KEPT_PROMISE, SearchOptions, Step, losers_of
@@ -37,7 +37,6 @@ GENTLER = 1e3  # factor on the input weights for each unit of caution
 GAIN_SHARE, CAUTION_PARTS = 0.5, 12  # of the mean gain to fall below; parts of a unit of caution
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
 SAME_STEP = 0.2  # relative distance to a run that lost within which a step counts as the same
-WITNESS = 3.0  # factor on a model's largest miss, below which its prediction of a ruin says nothing
 
 
 def begun_at(task: Task, trials: Sequence[Trial], predicted: Array) -> Trial:
@@ -62,7 +61,7 @@ class About:
     If a trial did not start at s_0, its utility can't be compared with predicted runs from s_0. So
     gains are relative to theta's own run in the grounded model (`already`), which equals the trial
     if it started at s_0: a first sample that differs from s_0 by no more than the sensors' noise
-    (`begun_at`). `original`: whether `make` plans without the adopted effects.
+    (`begun_at`).
     """
 
     def __init__(
@@ -71,10 +70,8 @@ class About:
         incumbent: Tried,
         options: SearchOptions,
         way: Way = "",
-        original: bool = False,
     ) -> None:
         self.make, self.incumbent, self.options, self.way = make, incumbent, options, way
-        self.original = original
         planner, plan = make.planner, make.planner.engaged
         said = incumbent.candidate.predicted_states
         own = planner.lift(begun_at(planner.task, incumbent.trials, said))
@@ -110,8 +107,6 @@ class About:
     @property
     def slopes(self) -> Slopes:
         """Which derivatives the model uses."""
-        if self.original:
-            return "original, corrected" if self.corrected else "original"
         return "corrected" if self.corrected else ""
 
     def _kept(self) -> bool:
@@ -202,19 +197,6 @@ class About:
             if abs(made.predicted_gain) <= self.least:
                 break
         return doubted or unsafe
-
-    def ruined_by(self, made: Candidate) -> bool:
-        """Return whether this model gives a step of another one far more than the best cost.
-
-        This model replays the best trial, too. A model that missed its own steps by about as much
-        is no witness.
-        """
-        history = self.make.now.history
-        own = losers_of(history, self.incumbent.candidate.id, self.make.fingerprint)
-        ids = {candidate.id for candidate in own if not candidate.of_original}
-        missed = [t.promised - t.utility for t in history if t.candidate.id in ids]
-        lost = self.already - predicted(self.real, made.policy).utility
-        return not lost <= max([-self.incumbent.utility, *(WITNESS * miss for miss in missed)])
 
     def _disturbed(self, policies: Sequence[Policy]) -> list[float]:
         """Return the costs of policies in the alternatives; 0 without alternatives.

@@ -35,7 +35,6 @@ if TYPE_CHECKING:
 
 
 GOLDEN = 0.6180339887498949  # multiples of it, modulo 1, cover an interval evenly (Weyl 1916)
-DEARER = (1.0, 10.0, 100.0, 1000.0)  # factors on the input weights for gains that are tried
 LOOSE = 64.0  # factor on the speed a dry friction builds up over: it then hardly damps
 
 
@@ -62,12 +61,6 @@ class Planner:
     def fingerprint(self) -> str:
         """Fingerprint of the planning model, see `model_fingerprint`."""
         return model_fingerprint(self.plan)
-
-    @property
-    def as_given(self) -> bool:
-        """Whether nothing was adopted: plans are made with the task's own model and latency."""
-        latencies = np.array([self.plan.latency, self.task.latency])
-        return self.plan.model is self.task.model and not np.ptp(latencies, axis=0).any()
 
     @property
     def needs_margin(self) -> bool:
@@ -173,8 +166,8 @@ class Planner:
     def first_policy(self, caution: int = 0, tick: Tick | None = None) -> tuple[Policy, Solution]:
         """Return the planning model's own policy, with gains on measured states only.
 
-        Of several sets of gains the one with the least predicted cost is chosen: those designed
-        with smoothed kinks, and those without dry friction for ever larger input weights.
+        With dry friction these are designed as if it built up slowly: while a joint sticks, it
+        needs none, and would have none once it slips.
 
         Args:
             caution: how often a first policy has crashed.
@@ -184,18 +177,15 @@ class Planner:
         from grounded.solve.ddp import sweep
 
         policy, found = first_policy(self.aim, caution, tick, self.widths)
-        if self.plan.model.n == self.task.model.n or policy.gain is None:
+        if policy.gain is None or (self.plan.model.n == self.task.model.n and not self.widths):
             return policy, found
-        task, n = cautious(self.aim, caution), self.task.model.n
-        units = task.model.states
-        made = [measured_gains(task.problem(), found.z, found.u, found.K, n, units)]
-        exact = self.plan.problem(exact=True)
-        for factor in DEARER if self.widths else ():
-            dear = self.dearer(task.problem(exact=True), factor)
-            K = sweep(dear, found.z, found.u).gains.K
-            made.append(measured_gains(dear, found.z, found.u, K, n, units))
-        policies = [dataclasses.replace(policy, gain=K) for K in made]
-        return max(policies, key=lambda one: predicted(exact, one).utility), found
+        task, n, K = cautious(self.aim, caution), self.task.model.n, found.K
+        problem = task.problem()
+        if self.widths:
+            problem = self.dearer(task.problem(exact=True), 1.0)
+            K = sweep(problem, found.z, found.u).gains.K
+        K = measured_gains(problem, found.z, found.u, K, n, task.model.states)
+        return dataclasses.replace(policy, gain=K), found
 
     def with_model(self, model: Model) -> Planner:
         """Return the planner with other parameter values of the planning model."""

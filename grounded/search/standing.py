@@ -31,14 +31,8 @@ from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.certainty import judged
-from grounded.search.difference import (
-    LUCK,
-    Difference,
-    last_gain,
-    missed_by_start,
-)
+from grounded.search.difference import LUCK, Difference, Starts, last_gain, missed_by_start
 from grounded.search.pictures import search_figure
-from grounded.search.starts import Starts
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
@@ -158,7 +152,7 @@ class Standing(Result):
     def lead_doubt(self) -> Finding | None:
         """What may explain the best one's lead on the model's own policy."""
         lead = self.lead
-        return lead.lead if lead is not None and lead.doubt else None
+        return lead.lead if lead is not None and not lead.sure else None
 
     def verdict(self, tried: Tried) -> str:
         """Return the verdict on a candidate, see `Tried.verdict`."""
@@ -386,7 +380,6 @@ def _hardly(
         gain=gained,
         least=tolerance if little else None,
         error=None if little else between.error,
-        few=None if little else between.few,
     )
 
 
@@ -505,7 +498,7 @@ def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Find
     """
     excused = doubt.excused(best)
     share = max(doubt.candidate.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
-    known = not excused and best.repeats > 0
+    known = not excused and math.isfinite(best.deviation)
     return found(
         "search.in_doubt",
         made.id,

@@ -7,9 +7,8 @@ import pytest
 from scipy.stats import ttest_ind
 
 from grounded.search.candidate import Tried
-from grounded.search.certainty import with_chances
-from grounded.search.difference import Difference, in_question
-from grounded.search.scatter import Repeats
+from grounded.search.certainty import with_chance
+from grounded.search.difference import Difference, Repeats, in_question
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -56,5 +55,6 @@ def test_exact_repeats_show_at_any_utility_that_nothing_scatters():
 )
 def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repeats, word):
     history = [tried(-90.0, base=""), tried(*repeats), tried(utility)]
-    history = with_chances(history, Repeats(history))
-    assert [one.verdict() for one in history] == ["first", "better", word]
+    pool, befores = Repeats(history), [None, *history]
+    told = [with_chance(*two, history, pool) for two in zip(history, befores, strict=False)]
+    assert [one.verdict() for one in told] == ["first", "better", word]

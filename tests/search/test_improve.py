@@ -18,10 +18,10 @@ from grounded.model import Model, Param
 from grounded.models import car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import simulate
-from grounded.search.ask_tell import learn
+from grounded.search.ask_tell import Search, learn
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.planner import model_fingerprint
+from grounded.search.planner import Planner, model_fingerprint, planner_with
 from grounded.search.step.directions import damped, direction
 from grounded.search.step.step_size import SearchOptions
 from grounded.solve.bias import ground
@@ -195,14 +195,31 @@ def test_damping_is_a_price_on_leaving_the_trials_inputs():
 def test_the_bias_goes_to_the_original_model_not_to_the_last_biased_one():
     """After two trials only the incumbent's own bias counts: errors do not accumulate."""
     task, candidates, trials = story("rover")
-    made = propose(task, candidates, trials, SearchOptions()).candidate
+    options = SearchOptions(step="full")  # with the model's own derivatives
+    made = propose(task, candidates, trials, options).candidate
     worse = replace(trials[0], states=trials[0].states + 5.0)
-    again = propose(task, candidates, [worse, trials[1]], SearchOptions()).candidate
+    again = propose(task, candidates, [worse, trials[1]], options).candidate
     assert made.base == again.base == "c0002"
     grounding = ground(task, trials[1], exact=True, match_inputs=True)
     exact = grounding.on(task.problem(exact=True))
     np.testing.assert_array_equal(made.predicted_states, simulate(exact, made.policy).states)
     np.testing.assert_array_equal(again.predicted_states, simulate(exact, again.policy).states)
+
+
+def test_a_wrong_effect_that_was_adopted_does_not_hold_the_search():
+    task = cart_task()
+    plant, planner = Plant(other(task.model, 1.3)), Planner(task, task)
+    wrong = replace(planner_with(task, [("rate_gain:v", {"g": -1.6})]), task=task)
+    best = []
+    for after in (planner, wrong):
+        search, now = Search(task, planner=planner), planner
+        while (made := search.ask()) is not None:
+            search.tell(drive(task, plant, made))
+            if now is planner is not after:
+                now, told = after, {"candidates": search.candidates, "trials": search.trials}
+                search = Search(task, planner=after, **told)
+        best.append(search.best.utility)
+    assert best[1] > 1.002 * best[0]
 
 
 @pytest.mark.parametrize("b", [30.0])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded.search.planner import Planner, planner_with, predicted
+from grounded.search.planner import planner_with, predicted
 from small_tasks import rover_task
 
 LATE = ("delay:turn", {"d": 0.12})  # with TASK, 2.8 steps: without play, z has three past inputs
@@ -47,5 +47,3 @@ def test_a_planner_remembers_what_earlier_policies_feed_back(late):
     assert more.plan.problem().depths == more.aim.problem().depths == (1, 3)
     assert more.fingerprint == play.fingerprint and more.plays == play.plays
     assert planner.feeding_back([policy]) is planner
-    bare = Planner(TASK, TASK)
-    assert bare.as_given and bare.feeding_back([policy]).as_given and not play.as_given

@@ -6,10 +6,7 @@ import numpy as np
 from scipy.stats import t
 
 from grounded.search.candidate import Tried
-from grounded.search.scatter import (
-    PIECES,
-    Repeats,
-)
+from grounded.search.difference import PIECES, Repeats
 
 
 def runs(pieces, cost=10.0):

@@ -123,4 +123,4 @@ def test_a_target_that_was_drawn_in_readings_of_a_biased_sensor_is_told(w):
 
     found = told(1.0)
     assert found["about"] == ["theta"] and found["facts"]["end"]["value"] == 1.0
-    assert "end" not in told(0.2)["facts"]  # it ends where the sensor shows 0
+    assert told(0.2) is None  # it ends where the sensor shows 0

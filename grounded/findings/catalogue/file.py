@@ -69,8 +69,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "rows": Entry(
         "refuse",
-        "{about} has {rows} rows below its header[[, expected {needs} or more]][[, of which [task] "
-        "horizon uses {used}]]",
+        "{about} has {rows} rows below its header[[, expected {needs} or more]]",
         "[[target? draw the manoeuvre, or write a row per control step with t and the "
         "states]][[add rows, or set [task] horizon = {horizon}]]",
     ),

@@ -42,8 +42,7 @@ ENTRIES: dict[str, Entry] = {
         "changed model's own plan, instead of a step from {base}]][[{base} with its gains reduced "
         "to {share:%}: its feedback made the inputs swing]][[iteration {iteration}: {step} from "
         "{base}]][[corrected? , with derivatives corrected by the trials]][[gentle? , its gains as "
-        "low as ran without oscillating]][[original? , by the model without the adopted effects, "
-        "which tells the runs that lost better]], {seconds}",
+        "low as ran without oscillating]], {seconds}",
     ),
     "predicted": Entry(
         "note",
@@ -63,15 +62,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "untested": Entry(
         "note",
-        "unknown: no run has tested the model[[changed?  since it was changed]][[; by the last "
-        "diagnosis it misses {what} by {miss:size} in {ahead}]][[; it can be checked against "
-        "{logs:log} of data (`grounded diagnose`)]]",
+        "unknown: no run has tested the model[[changed?  since it was changed]][[; it can be "
+        "checked against {logs:log} of data (`grounded diagnose`)]]",
         "[[exact? the prediction starts exactly at [task] start]]",
-    ),
-    "samples": Entry(
-        "note",
-        "{candidate} is planned for samples {age} [[newer? newer than in its log]][[!newer? old]]"
-        "[[; in the runs so far: {least} to {most}]]",
     ),
     "model": Entry("note", "the model is {what}"),
     "lacks": Entry(
@@ -97,13 +90,12 @@ ENTRIES: dict[str, Entry] = {
     "small": Entry(
         "note",
         "{candidate} promises {gain:.2g} over {best}, less than [[its trial can show: a gain below "
-        "{luck:.2g} may be luck]][[, from {few:repeat} only]][[the model's likely error there, "
+        "{luck:.2g} may be luck]][[the model's likely error there, "
         "judging by earlier trials: {error:.3g}]]",
         "[[it gains at most {share:%} of what {best} costs: run it if that is worth a run, else "
         "stop with {best} (`export best`)]]",
     ),
     # the first plan of a task
-    "no_motion": Entry("note", "the target stays where the run starts, in every state"),
     "no_limits": Entry("note", "[limits] has none for {about}: plans may send values of any size"),
     "without_effect": Entry(
         "note",
@@ -188,13 +180,6 @@ ENTRIES: dict[str, Entry] = {
         "{of:.4g}",
     ),
     # what the robot will do
-    "not_logged": Entry(
-        "note",
-        "{candidate} feeds back {about}, of which the log has no column: your program has to "
-        "compute {about:it/them} while it runs",
-        "let it log {about:it/them}, map {about:it/them} in [log], and add {about:it/them} to "
-        "[estimate] measured, with the scatter at standstill",
-    ),
     "time_step": Entry(
         "warn",
         "{about} is missed by {share:%} of its change in a step: the integrator's steps of {step} "

@@ -39,14 +39,13 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "no step improved on {best}[[ down to alpha = {alpha:.6g}]][[ in the last {last} "
         "candidates]][[ ({lost} lost)]][[; the next promises {gain}, with a likely error of "
-        "{error}]][[; the model promises less than {least:%} from smaller steps]][[, from "
-        "{few:repeat} only]]: {best} is the "
-        "result",
+        "{error}]][[; the model promises less than {least:%} from smaller steps]]: "
+        "{best} is the result",
     ),
     "little": Entry(
         "note",
         "the last {last} candidates gained {gain:.3g} in total, less than [[{least:%} each "
-        "([search] tolerance)]][[its standard error of {error:.2g}]][[, from {few:repeat} only]]: "
+        "([search] tolerance)]][[its standard error of {error:.2g}]]: "
         "{best} is the result",
     ),
     # it has ended without one
@@ -138,21 +137,19 @@ ENTRIES: dict[str, Entry] = {
     "gain": Entry(
         "note",
         "the last gain in utility, of {after} over {before}, is {gain}[[, an improvement with "
-        "probability {probability:.2f}]][[, from {few:repeat} only]][[exact? ; repeated trials "
+        "probability {probability:.2f}]][[exact? ; repeated trials "
         "agree exactly]][[single? ; runs of similar utility were not repeated, so their noise is "
         "unknown]][[; by the model {start:.3g} of it is due to where their runs began, and "
-        "{own:.3g} to the policy]][[open? : which of the two is better is open]][[apart? , but "
+        "{own:.3g} to the policy]][[apart? , but "
         "their runs began apart, and what that is worth is not known]]",
     ),
     "better": Entry(
         "note",
-        "{share:%} {better:1=better,0=worse} than the model's own policy[[, +- {error:%}]][[, from "
-        "{few:repeat} only]][[; by the model, different start states alone changed the cost by "
-        "{start:%}]]",
+        "{share:%} {better:1=better,0=worse} than the model's own policy[[, +- {error:%}]][[; by "
+        "the model, different start states alone changed the cost by {start:%}]]",
     ),
     "lead": Entry(
         "note",
-        "{doubt:scatter=the scatter of repeats,starts=where the runs began,unknown=scatter that is "
-        "not known yet} may explain its lead on the model's own policy",
+        "the scatter of runs, or where they began, may explain its lead on the model's own policy",
     ),
 }

@@ -7,8 +7,7 @@ from grounded.findings.catalogue import Entry
 ENTRIES: dict[str, Entry] = {
     "readings": Entry(
         "note",
-        "the sensor of {about} reads {bias}, and the target is in its readings[[; it ends at "
-        "{end}]][[; [task] start is {start}]]",
+        "the sensor of {about} reads {bias}, and the target is in its readings; it ends at {end}",
     ),
     "start": Entry(
         "note",

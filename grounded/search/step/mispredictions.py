@@ -28,10 +28,6 @@ Steps that were made with corrected derivatives and lost are also left out in tu
 laws that such a trial refutes still predict trials nearby.
 With a single other trial nothing can be left out: the value is then at least the share of the
 mispredictions that law 1 leaves in the held-out parts of the run.
-
-Laws of first order hold in a neighbourhood. So runs that strayed from it (`strayed`) correct
-nothing: one run with a motor wired the wrong way round gave derivatives whose step lost six times
-the best cost.
 """
 
 from __future__ import annotations
@@ -60,7 +56,6 @@ ASKED = 3  # nearest trials that are left out in turn
 LATEST = 100  # latest trials that these are chosen from
 DEAD = 1e-4  # regularisation, relative to the mean square effect of the inputs
 WORST = 1e12  # cost of a run that diverges
-STRAYED = 100.0  # factor on the costs promised and best so far: a run that misses by more strayed
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,20 +179,10 @@ def neighbours(
     if own is None:
         return None
     told = [t for t in history[-LATEST:] if t is not incumbent and np.isfinite(t.utility)]
-    told = [t for t in told if not strayed(t, incumbent)]
     ran = [(o, t) for t in told if (o := seen(planner, t, grounded)) is not None]
     moved = [apart(grounded, o.run, own.run) for o, _ in ran]
     nearest = [ran[j] for j in np.argsort(moved, kind="stable") if moved[j] > 0]
     return (own, nearest) if nearest else None
-
-
-def strayed(tried: Tried, best: Tried) -> bool:
-    """Return whether runs left the neighbourhood in which mispredictions correct derivatives.
-
-    They did if they missed their promise by far more than the cost promised and the best one's.
-    """
-    cost = max(abs(tried.promised), abs(best.utility), 1e-9)
-    return tried.promised - tried.utility > STRAYED * cost
 
 
 def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:

@@ -144,27 +144,16 @@ def test_a_candidate_is_exported_beside_a_damaged_file_of_another(tmp_path):
         export_candidate(Folder(w.folder), "best", "json", tmp_path / "b.json")
 
 
-def test_only_the_candidates_own_export_counts_as_made(tmp_path, monkeypatch):
-    mine, other = (
-        make(tmp_path / name, config=CONFIG.partition("[system]")[0].replace("10.0", weight))
-        for name, weight in (("w", "10.0"), ("other", "11.0"))
-    )
-    made = [propose_in(w).candidate.id for w in (mine, other)]
-    assert made == ["c0001"] * 2
-    here = tmp_path / "here"
-    here.mkdir()
-    monkeypatch.chdir(here)
+def test_a_candidate_that_was_exported_is_to_be_run_and_its_log_taken_in(tmp_path, monkeypatch):
+    w = make(tmp_path / "w", config=CONFIG.partition("[system]")[0])
+    propose_in(w)
+    monkeypatch.chdir(tmp_path)
     for form in ("npz", "json", "csv"):
-        path = here / f"c0001.{form}"
-        export_candidate(other, "c0001", form, path)
-        assert to_run(mine, "c0001").verb == "export" and to_run(other, "c0001").verb == "next"
-        export_candidate(mine, "c0001", form, path)
-        assert to_run(mine, "c0001").verb == "next" and exported_as(mine, "c0001") == form
+        assert to_run(w, "c0001").verb == "export"
+        path = tmp_path / f"c0001.{form}"
+        export_candidate(w, "c0001", form, path)
+        assert to_run(w, "c0001").verb == "next" and exported_as(w, "c0001") == form
         path.unlink()
-    (here / "c0001.csv").write_text("t,x,force\n0,0,0\n")  # its log
-    assert to_run(mine, "c0001").verb == "export"
-    (here / "c0001.mcap").write_bytes(mine.candidate_bytes("c0001"))
-    assert to_run(mine, "c0001").verb == "next"
 
 
 def test_an_ending_that_names_no_format_is_refused_unless_the_format_is_named(tmp_path):

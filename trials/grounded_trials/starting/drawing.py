@@ -36,7 +36,6 @@ from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import figure, misread
 from grounded_trials.workspace.candidates.at_rest import (
-    read_at_start,
     rest_at_end,
     rest_of_trials,
 )
@@ -305,16 +304,9 @@ def _in_readings(case: _Case) -> Iterator[Finding]:
         family, _, name = str(effect["name"]).partition(":")
         if family != "sensor_bias" or name not in case.columns:
             continue
-        b, unit = effect["b"], case.units[name]
-        ends = float(case.columns[name][-1])
-        begins = float(case.workspace.config.task.start.get(name, case.columns[name][0]))
-        start = None if read_at_start(case.workspace, name, b) else begins
-        off = [
-            None if at is None or math.isclose(at, b, rel_tol=OBEYED) else Quantity(at, unit)
-            for at in (ends, start)
-        ]
-        if any(off):
-            yield found("target.readings", name, bias=misread(b, unit), end=off[0], start=off[1])
+        b, unit, end = effect["b"], case.units[name], float(case.columns[name][-1])
+        if not math.isclose(end, b, rel_tol=OBEYED):
+            yield found("target.readings", name, bias=misread(b, unit), end=Quantity(end, unit))
 
 
 def _of_log(case: _Case) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 from grounded.result import UNSAID, Document
 from grounded.search.design import Drive, design
-from grounded.search.scatter import sensor_noise
+from grounded.search.noise import sensor_noise
 from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.candidates.at_rest import resting

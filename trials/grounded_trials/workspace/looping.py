@@ -18,7 +18,6 @@ from grounded_trials.workspace.candidates.exporting import (
     Exported,
     export_candidate,
     exported_as,
-    void_exports,
 )
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -41,7 +40,6 @@ class NextRun(Document):
     proposed: Proposed | None = field(metadata={"key": "propose"})
     # None if the search has ended
     exported: Exported | None = field(metadata={"key": "export"})
-    removed: tuple[Path, ...] = ()  # deleted exports of candidates that are void now
 
     def summary(self) -> str:
         """Return what was stored, and what comes next."""
@@ -138,8 +136,4 @@ def next_in(
         runner = runner and form in ("", "npz")
         file = workspace.folder / f"{name}.{form or ('npz' if runner else 'json')}"
         exported = export_candidate(workspace, name, form, file, runner=runner)
-    name = "" if proposed.candidate is None else proposed.candidate.id
-    removed = void_exports(workspace, name)
-    for path in removed:
-        path.unlink()
-    return NextRun(taken, proposed, exported, removed)
+    return NextRun(taken, proposed, exported)

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cli import grounded, plain
+from cli import grounded
 from facts import of_code
 from grounded.errors import GroundedError, NextCommand
 from grounded.plant import Plant
@@ -174,11 +174,3 @@ def test_a_model_that_was_edited_is_told_by_every_command_and_no_run_is_blamed(w
     made = w.propose()
     assert made.candidate.id == "c0003" and of_code(made, "plan.outdated")
     assert not of_code(w.status(), "plan.*") and not of_code(w.propose(), "plan.outdated")
-
-
-def test_a_deleted_export_of_a_void_candidate_is_told(w):
-    log, export = w.run("c0001").trial_file, w.folder / "c0002.npz"
-    w.export("c0002", export)
-    (w.folder / "model.py").write_text(MODEL.replace("Param(1.0", "Param(1.5"))
-    out = grounded("-C", w.folder, "next", log, "--candidate", "c0001").out
-    assert export.name in plain(out).replace("\n", "") and not export.exists()

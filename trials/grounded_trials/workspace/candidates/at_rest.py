@@ -20,8 +20,8 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model, is_clock
-from grounded.places import integrals, rate_states, true_values
-from grounded.search.scatter import sensor_noise
+from grounded.places import integrals, rate_states
+from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.wording import per_second, with_unit
@@ -36,7 +36,6 @@ if TYPE_CHECKING:
 STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
 LEAST_STEPS = 3  # of it
 STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
-SAME = 0.25  # of the distance between two starts: within it of one of them, a robot stood there
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,33 +93,6 @@ def standstill(
     at, held = np.median(x[steps // 2 :], axis=0), np.median(later, axis=0)
     needs = (held != 0) & ((np.ptp(later, axis=0) == 0) | (np.abs(held) > STEADY * sent))
     return Stand(at, held, STEADY * whole, needs, trial.id)
-
-
-def standstills(workspace: Folder) -> list[Stand]:
-    """Return where the robot stood at the start of the stored trials that begin at a standstill."""
-    try:
-        trials = workspace.task_trials()
-    except GroundedError:  # a damaged file, which other commands report
-        return []
-    model = workspace.base_model
-    return [stand for trial in trials if (stand := standstill(model, trial))]
-
-
-def read_at_start(workspace: Folder, name: str, bias: float) -> str:
-    """Return the trial in whose first rows a sensor with a bias reads what [task] start has; or "".
-
-    A start that was measured by the sensor is right as it is. A trial in which the robot stands
-    with another reading contradicts it.
-
-    Args:
-        workspace: the workspace with the logs.
-        name: the state.
-        bias: of its sensor, in the state's unit.
-    """
-    i, start = workspace.base_model.state_names.index(name), workspace.task.start
-    found = standstills(workspace)
-    off = [abs(float(one.states[i] - start[i])) for one in found]
-    return found[0].trial if found and max(off) <= SAME * abs(bias) else ""
 
 
 def steady(sent: Array, span: Array | float) -> Array:
@@ -255,32 +227,6 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
     return None
 
 
-def rest_value(workspace: Folder, at: Mapping[str, float], name: str) -> float:
-    """Return what the sensor of one state shows where the robot rests; 0 if that is not found.
-
-    Adopted effects count: on a beam that is not level, or whose sensor has a bias, a ball rests at
-    another angle than 0. Dry friction would hold it at many, so it is softened.
-
-    Args:
-        workspace: the workspace with the model.
-        at: the other states there, by name; those that are not given are 0.
-        name: the state.
-    """
-    try:
-        task = workspace.planner.loose
-    except GroundedError:  # [reward] still weighs what the target has no column for
-        return 0.0
-    names = task.model.state_names
-    logged = {i: names[k] for i, k in true_values(names, names[workspace.task.model.n :]).items()}
-    x = np.array([at.get(logged.get(i, own), 0.0) for i, own in enumerate(names)])
-    free = np.array([logged.get(i, own) == name for i, own in enumerate(names)])
-    room = ZERO_INPUT * ZERO_INPUT * (1 + np.abs(task.past))  # the input is held
-    held = replace(task, start=x, low=task.past - room, high=task.past + room)
-    found_at = resting(held, free)
-    value = 0.0 if found_at is None else float(found_at[names.index(name)])
-    return value if abs(value) > ZERO_INPUT else 0.0
-
-
 def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
     """Return whether no input inside the limits can stop the motion at the start, linearised."""
     if not np.isfinite(task.high - task.low).all():
@@ -310,8 +256,13 @@ def rest_of_trials(workspace: Folder) -> tuple[dict[str, float], str]:
         The values for [task] start that are not zero, inputs that hold it included, and the trial;
         ({}, "") if [task] start has values, or no trial tells.
     """
-    for stand in [] if workspace.config.task.start else standstills(workspace):
-        if found := _rest_of(workspace, stand):
+    try:
+        trials = [] if workspace.config.task.start else workspace.task_trials()
+    except GroundedError:  # a damaged file, which other commands report
+        trials = []
+    for trial in trials:
+        stand = standstill(workspace.base_model, trial)
+        if stand and (found := _rest_of(workspace, stand)):
             return found, stand.trial
     return {}, ""
 
@@ -354,8 +305,7 @@ def rest_at_end(
 ) -> Rest | None:
     """Return columns and weights for the free states of a line; None if it leaves none free.
 
-    These are the states that have a rate, with it; if none has one, the first. A state rests where
-    its sensor shows it at rest with all adopted effects.
+    These are the states that have a rate, with it; if none has one, the first. They rest at 0.
 
     Args:
         workspace: the workspace with the model.
@@ -366,14 +316,11 @@ def rest_at_end(
     rates, free = rate_states(model), [name for name in model.states if name not in columns]
     if not free:
         return None
-    last = {name: float(column[-1]) for name, column in columns.items()}
-    last |= {name: 0.0 for name in rates.values() if name in last}
     rows, found, ranges = len(next(iter(columns.values()))), dict[str, Array](), {}
     for name in [name for name in free if name in rates] or free[:1]:
-        begins, at = start.get(name, 0.0), rest_value(workspace, last, name)
-        last[name] = at
-        found[name] = np.linspace(begins, at, rows)
-        ranges[name] = np.linspace(min(begins, at - SMALLEST_RANGE), at, rows)
+        begins = start.get(name, 0.0)
+        found[name] = np.linspace(begins, 0.0, rows)
+        ranges[name] = np.linspace(min(begins, -SMALLEST_RANGE), 0.0, rows)
         if (rate := rates.get(name)) is not None and rate not in columns:
             found[rate], ranges[rate] = np.zeros(rows), ranges[name]  # only for its usual weight
     usual = usual_weights(model, {**columns, **ranges})

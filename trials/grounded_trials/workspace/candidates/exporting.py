@@ -1,4 +1,4 @@
-"""export: write a candidate for other programs (csv, json, npz), and find void exports.
+"""export: write a candidate for other programs (csv, json, npz), and say how to run one.
 
 All three files have the same contents. With z = [state, past inputs] (names in `z_names`),
 
@@ -29,11 +29,7 @@ from grounded.policy import Policy, to_arrays
 from grounded.result import UNSAID, Document
 from grounded.search.standing import Ending, Phase, Standing
 from grounded_trials.store.store import DIGITS, hash_file, write_atomically
-from grounded_trials.workspace.candidates.handover import (
-    Check,
-    checked_candidate,
-    intact,
-)
+from grounded_trials.workspace.candidates.handover import checked_candidate
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
     known_end,
@@ -46,28 +42,10 @@ LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [sta
 OPEN_LOOP = "u_t = clip(feedforward_t, low, high)"  # no gain and no reference
 
 
-def is_export(workspace: Folder, identity: str, path: Path) -> bool:
-    """Return whether a file is byte for byte the candidate as exported, or as proposed (mcap)."""
-    form = path.suffix.lstrip(".").lower()
-    try:
-        if form == "mcap":
-            data = workspace.candidate_bytes(identity)
-        elif form in (known := encoders()):
-            made, meta = workspace.candidate(identity)
-            data = known[form](made.policy, units_of(workspace), about_of(identity, meta))
-        else:
-            return False
-        return path.stat().st_size == len(data) and path.read_bytes() == data
-    except (OSError, GroundedError):
-        return False
-
-
-def exported_as(workspace: Folder, candidate: str) -> str:
+def exported_as(workspace: Folder, name: str) -> str:
     """Return the format in which a candidate was exported here or to the workspace; "" for none."""
-    places = [at / candidate for at in (workspace.folder, Path())]
-    files = [path.with_suffix(f".{form}") for path in places for form in encoders()]
-    found = (path for path in files if path.is_file() and is_export(workspace, candidate, path))
-    return next((path.suffix[1:] for path in found), "")
+    places = (at / f"{name}.{form}" for form in encoders() for at in (workspace.folder, Path()))
+    return next((path.suffix[1:] for path in places if path.is_file()), "")
 
 
 def encoders() -> dict[str, Callable[[Policy, dict[str, str], dict[str, str]], bytes]]:
@@ -164,8 +142,7 @@ def not_stored(workspace: Folder, candidate: str) -> Path | None:
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
 
-    A run that was not ingested yet is ingested first. A candidate counts as exported if a file with
-    the contents of its export is in the workspace or in the current folder.
+    A run that was not ingested yet is ingested first.
 
     Args:
         workspace: the workspace.
@@ -176,8 +153,7 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
         waits = not_stored(workspace, candidate)
         return NextCommand("run", named) if waits is None else NextCommand("ingest", (str(waits),))
     name = named[0] if named else candidate
-    files = (path for at in (workspace.folder, Path()) for path in at.glob(f"{name}.*"))
-    if any(is_export(workspace, candidate, path) for path in files):
+    if exported_as(workspace, name):
         return NextCommand("next", ("LOG", "--candidate", candidate) if named else ("LOG",))
     return NextCommand("export", (name, "--runner"))
 
@@ -323,24 +299,3 @@ def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:
     if ending:
         one_of(f"the ending of {path}", ending, formats)
     return default
-
-
-def void_exports(workspace: Folder, but: str = "") -> tuple[Path, ...]:
-    """Return exported files in the workspace's folder whose candidate must not be run any more.
-
-    Only files that are byte for byte what `export` or `next` wrote count, of candidates that no
-    trial ran.
-
-    Args:
-        workspace: the workspace, in whose folder `next` writes.
-        but: the candidate that was just handed over, which is skipped.
-    """
-    ran = {stored.trial.candidate for stored in workspace.whole_trials()}
-    names = [name for name in workspace.candidate_ids() if name not in {but, *ran}]
-    found = []
-    for path in (workspace.folder / f"{name}.{form}" for name in names for form in encoders()):
-        if path.is_file() and is_export(workspace, path.stem, path):
-            made, meta = intact(workspace.candidate_bytes(path.stem), path.stem)
-            if tuple(Check(workspace, made, meta, False, None).reasons()):
-                found.append(path)
-    return tuple(found)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.findings import Finding, Quantity, Weight, found
+from grounded.findings import Finding, Quantity, found
 from grounded.places import samples
 from grounded.search.feedback.oscillation import jumps
-from grounded.search.scatter import sensor_noise
+from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded_trials.workspace.candidates.at_rest import held_before
 from grounded_trials.workspace.folder import Folder
@@ -84,12 +84,6 @@ def left_open(workspace: Folder, proposal: Proposal, again: bool) -> list[Findin
     """
     plan = Plan(workspace, proposal.candidate, proposal.refused, again)
     return [one for check in CHECKS for one in check(plan)]
-
-
-def no_motion(plan: Plan) -> Iterator[Finding]:
-    """The target stays where the run starts."""
-    if np.allclose(plan.task.target, plan.task.start):
-        yield found("plan.no_motion")
 
 
 def no_limits(plan: Plan) -> Iterator[Finding]:
@@ -198,14 +192,6 @@ def unguarded(plan: Plan) -> Iterator[Finding]:
             yield found("plan.unguarded", *bare, unweighed=unweighed)
 
 
-def unused_rows(plan: Plan) -> Iterator[Finding]:
-    """target.csv has more rows than the horizon."""
-    name, used = str(plan.workspace.config.task.target), plan.task.horizon + 1
-    rows = len(plan.workspace.read_target(plan.workspace.folder / name)[1])
-    if rows > used:
-        yield found("file.rows", name, rows=str(rows), used=used, weight=Weight.NOTE)
-
-
 def not_at_rest(plan: Plan) -> Iterator[Finding]:
     """The robot is not at rest at its start, but would be under another input."""
     if one := held_before(plan.workspace, plan.again):
@@ -213,13 +199,11 @@ def not_at_rest(plan: Plan) -> Iterator[Finding]:
 
 
 CHECKS: Sequence[Callable[[Plan], Iterator[Finding]]] = (
-    no_motion,
     no_limits,
     without_effect,
     limits_of_log,
     off_target,
     rough,
     unguarded,
-    unused_rows,
     not_at_rest,
 )

@@ -295,7 +295,7 @@ class Check:
         elif self._changed:
             told.append(found("plan.outdated", name, candidate=name))
         if self.same_task and not self.standing.trials:
-            told += [self._not_logged(), self._too_long()]
+            told.append(self._too_long())
         if self.same_task:
             told.append(self._coasting())
         yield from (one for one in told if one is not None)
@@ -329,18 +329,6 @@ class Check:
             if one.trial.candidate == name:
                 told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
                 yield told.knowing({"why": aside[one.stored.id]})
-
-    def _not_logged(self) -> Finding | None:
-        """Return which states are fed back although [log] has no column of them, only estimates."""
-        gain, config = self.candidate.policy.gain, self.workspace.config
-        mapped = self.workspace.log_mapping if config.estimate.names() else None
-        if gain is None or mapped is None:
-            return None
-        names = self.workspace.base_model.state_names
-        used = np.abs(gain[:, :, : len(names)]).max(axis=(0, 1)) > 0
-        told = [n for n, u in zip(names, used, strict=True) if u and n not in mapped.states]
-        name = self.candidate.id
-        return found("plan.not_logged", *told, candidate=name) if told else None
 
     def _too_long(self) -> Finding | None:
         """Return that the integrator's steps are too long for the model, if they are."""

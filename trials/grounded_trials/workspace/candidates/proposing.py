@@ -12,7 +12,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.result import Result
 from grounded.search.difference import in_question, last_gain
-from grounded.search.scatter import NoiseSoFar, noise_cost, noise_missed
+from grounded.search.noise import known_noise, noise_cost, noise_missed
 from grounded.search.standing import Ending, Phase
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates.exporting import to_run
@@ -220,9 +220,8 @@ def _told(
 
     made, now, task = proposal.candidate, proposal.standing, workspace.task
     assert made is not None
-    noises = NoiseSoFar(workspace.task_trials(), workspace.base_model.n)
     same = [t for t in now.history if t.candidate.id == made.id]
-    noise = noises.before(noises.first(made.id), made.seen)
+    noise = known_noise(workspace.task_trials(), made, workspace.base_model.n)
     cost = same[0].noise_missed if same else noise_missed(task, made, noise)
     whole = noise_cost(task, made.policy, noise)
     ahead = off_target_of(task, [made.predicted_run])
@@ -230,8 +229,8 @@ def _told(
     if not made.grounded:  # a run that no sensor measured
         ahead = tuple(replace(one, noise=0.0) for one in ahead)
     best, again = now.incumbent, any(t.trials for t in same)
-    aged, slow = trust.samples(made, now, task), workspace.planner.plan.model.system.note
-    notes = [*notes, *([aged] if aged else []), *([found("plan.model", what=slow)] if slow else [])]
+    slow = workspace.planner.plan.model.system.note
+    notes = [*notes, *([found("plan.model", what=slow)] if slow else [])]
     return Proposed(
         proposal,
         workspace.candidate_path(made.id),
@@ -243,7 +242,7 @@ def _told(
         trust.made_how(made, task, now.history),
         trust.predicted(made, cost, whole),
         None if best is None else trust.so_far(made, best),
-        trust.trust(workspace, made, now, whole - cost, status.diagnosis, status.since),
+        trust.trust(workspace, made, now, whole - cost),
         trust.extent_of(made, task),
     )
 

@@ -1,8 +1,7 @@
 """What a candidate promises, and how far its prediction can be trusted.
 
 Predictions of the model as it is now are compared with the runs that tested them. A prediction
-begins at [task] start; what it cost that runs began elsewhere is no error of it. Where no run has
-tested the model, the last diagnosis or the logs that it was fitted to stand in.
+begins at [task] start; what it cost that runs began elsewhere is no error of it.
 """
 
 from __future__ import annotations
@@ -19,13 +18,11 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import missed_by_start
 from grounded.search.step.step_size import Step
 from grounded.task import Task
-from grounded_trials.workspace.off_target import reaches, weighed_groups
+from grounded_trials.workspace.off_target import reaches
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Diagnosis
     from grounded.search.standing import Standing
     from grounded_trials.workspace.folder import Folder
-    from grounded_trials.workspace.last_diagnosis import Since
 
 LAST = 3  # recent predictions whose errors are told
 NOISE_SHARE = 0.2  # share of a cost above which its part due to sensor noise is told
@@ -105,7 +102,6 @@ def made_how(made: Candidate, task: Task, history: tuple[Tried, ...]) -> Finding
         own=int(made.way == "own plan"),
         crashes=0 if made.base else round(made.caution),
         corrected=int((made.grounded and bool(made.slopes)) or made.way == "slopes by step"),
-        original=int(made.of_original),
         gentle=int(bool(made.base) and made.caution > 0 and share is None),
     )
 
@@ -158,14 +154,7 @@ def predicted(made: Candidate, cost: float, whole: float) -> Finding:
     )
 
 
-def trust(
-    workspace: Folder,
-    made: Candidate,
-    now: Standing,
-    replayed: float,
-    diagnosis: Diagnosis | None,
-    since: Since | None,
-) -> Finding:
+def trust(workspace: Folder, made: Candidate, now: Standing, replayed: float) -> Finding:
     """Return how far recent predictions were off, and whether the promised gain exceeds that.
 
     Args:
@@ -173,8 +162,6 @@ def trust(
         made: what to run next.
         now: where the search stands.
         replayed: cost of the noise that its prediction has, from the log that it replays.
-        diagnosis: the last one, which tells how well the model predicts if no run did.
-        since: what changed since then.
     """
     ran = [tried for tried in now.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
@@ -182,29 +169,8 @@ def trust(
         return _tested(made, now, same, replayed)
     logs = len(workspace.trials()) - sum(len(tried.trials) for tried in now.history)
     exact = not now.trials and not workspace.config.reachable
-    measured = _by_diagnosis(workspace.task, diagnosis, since)
-    untested = found("plan.untested", made.id, changed=int(bool(ran)), exact=int(exact))
-    return untested.knowing(measured or {"logs": logs})
-
-
-def _by_diagnosis(
-    task: Task, found_last: Diagnosis | None, since: Since | None
-) -> dict[str, Fact | None]:
-    """Return how far the model as it is now misses the first weighed states, by a diagnosis."""
-    if found_last is None or since is None or not found_last.prediction_error:
-        return {}
-    rows = found_last.prediction_error
-    row = next((one for one in reversed(rows) if not one.whole_trial), rows[-1])
-    adopted = bool(since.adopted) and not since.missing
-    if since.changed and not adopted:
-        return {}
-    errors = row.with_effects if adopted else row.crude
-    for names, what in weighed_groups(task):
-        miss = math.hypot(*(errors.get(name, math.nan) for name in names))
-        if math.isfinite(miss):
-            far = Quantity(miss, task.model.states[names[0]])
-            return {"what": what, "miss": far, "ahead": Quantity(row.horizon_s, "s")}
-    return {}
+    changed = int(bool(ran))
+    return found("plan.untested", made.id, changed=changed, exact=int(exact), logs=logs)
 
 
 def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) -> Finding:
@@ -232,23 +198,3 @@ def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) 
     noise = len(best.trials) == 1 and gain < replayed
     facts |= {"gain": gain, "less": int(gain < missed[-1]), "noise": int(noise)}
     return found("plan.tested", made.id).knowing(facts)
-
-
-def samples(made: Candidate, now: Standing, task: Task) -> Finding | None:
-    """Return how old the samples are that a candidate is planned for."""
-    if not made.sample_age:
-        return None
-    from grounded.search.feedback.sample_age import different, run_ages
-
-    ages = run_ages(task, now.history)
-    apart = bool(ages) and different(task, min(ages), max(ages))
-    age = Quantity(abs(made.sample_age), "s")
-    return found(
-        "plan.samples",
-        made.id,
-        candidate=made.id,
-        age=age,
-        newer=int(made.sample_age < 0),
-        least=Quantity(min(ages), "s") if apart else None,
-        most=Quantity(max(ages), "s") if apart else None,
-    )

@@ -26,7 +26,6 @@ from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.frozen import median
 from grounded.search.candidate import Candidate
-from grounded.search.step.mispredictions import STRAYED
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
@@ -40,6 +39,7 @@ if TYPE_CHECKING:
     from grounded.search.candidate import Tried
 
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
+STRAYED = 100.0  # the same, from where on a run went far astray
 NO_CRASH = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
 GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
 # last steps, in most of which a state has to be that far off: noise is not

@@ -16,8 +16,8 @@ from grounded.accounts.sent import STEPS_TO_JUDGE
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.search.candidate import Tried
-from grounded.search.scatter import Repeats, sample_noise
-from grounded.search.starts import worth_of_start
+from grounded.search.difference import Repeats, worth_of_start
+from grounded.search.noise import sample_noise
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.candidates.search_state import standing_of
