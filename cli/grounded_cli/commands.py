@@ -308,7 +308,6 @@ def fit() -> None:
     help="Two groups of trials, T1,T2 T3,T4: what changed.",
 )
 @parallel("all processors")
-@flag("--instruments", help="Check the sensors only; takes some seconds.")
 @flag("--details", help="Also all findings, errors, rival effects and places.")
 def diagnose() -> None:
     """Find where the model is wrong, and which effect explains it.

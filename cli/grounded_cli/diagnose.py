@@ -24,7 +24,7 @@ from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.propose import show_extent
 from grounded_trials.wording import percent
 from grounded_trials.workspace.candidates.trust import extent_of
-from grounded_trials.workspace.diagnosing import unheld_in, unwritten_in
+from grounded_trials.workspace.diagnosing import unwritten_in
 from grounded_trials.workspace.last_diagnosis import left_out
 from grounded_trials.workspace.next_step import BEFORE_TRIALS
 
@@ -35,25 +35,15 @@ def diagnose(
     without: tuple[str, ...],
     compare: tuple[str, str] | None,
     jobs: int | None,
-    instruments: bool,
     details: bool,
 ) -> Iterator[Any]:
-    """Diagnose the trials, check their sensors, or compare two groups."""
+    """Diagnose the trials, or compare two groups."""
     workspace, chosen = open_workspace(), names_of(trials, "--trials", "t0001,t0002")
     first, second = map(names_in, compare or ("", ""))
     if compare and (chosen or not (first and second) or {*first} & {*second}):
         raise wrong(
             "--compare", got=" ".join(compare), must="groups", like="t0001,t0002 t0003,t0004"
         )
-    if instruments:
-        findings, alone = workspace.preflight(chosen), unheld_in(workspace, chosen)
-        yield {"preflight": [one.to_json() for one in findings], "unheld": list(alone)}
-        _instruments(findings, workspace.base_model.inputs)
-        if alone:
-            show(field("unchecked", f"{', '.join(alone)} (no other sensor)"))
-        if not findings:
-            show(field("sensors", "no fault"))
-        return show(f"\n{next_line(workspace.status().then)}")
     with stages() as stage:
         found = workspace.diagnose(
             chosen or first,

@@ -20,7 +20,6 @@ import numpy as np
 from grounded import places
 from grounded.frozen import Array, wrapped
 from grounded.model import Model
-from grounded.places import integrals
 from grounded.trial import Trial, stretches
 
 INSTANT_S = 1e-6  # [s] time step from which rates are computed
@@ -106,19 +105,6 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
         if fixed[i] and i not in by and {*by} <= {*shown}:
             found.append(Row(i, by, 0.0, float(low[i]), float(high[i])))
     return found
-
-
-def unheld(model: Model, trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the logged states that can't be checked against any other sensor.
-
-    Args:
-        model: whose kinematics relate sensors.
-        trials: of this model's states.
-    """
-    shown = [i for i in range(model.n) if any(np.isfinite(t.states[:, i]).any() for t in trials)]
-    held = {i for row in kinematic_rows(model, shown) for i in row.states}
-    held |= {i for one in integrals(model) if {one.i, one.j} <= {*shown} for i in (one.i, one.j)}
-    return tuple(model.state_names[i] for i in shown if i not in held)
 
 
 def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:

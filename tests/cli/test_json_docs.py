@@ -123,7 +123,6 @@ COMMANDS = [
     ("init", "--list"),
     ("recover", "{trial}", "-o", "{folder}/saved.mcap"),
     ("explain", "log.unit"),
-    ("diagnose", "--instruments"),
     ("init", "{folder}/more", "--blank", "--model", "{folder}/model.py"),
     ("next", "{trial}"),
 ]

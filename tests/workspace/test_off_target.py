@@ -47,7 +47,7 @@ def off(x=0.0, y=0.0, psi=0.0, steps=H):
     return states
 
 
-ALONG, END = (1, 1, 0.1, 0), (1, 1, 0, 0)
+ALONG = (1, 1, 0.1, 0)
 
 
 def test_the_position_is_one_distance_and_angles_are_wrapped():
@@ -59,23 +59,6 @@ def test_the_position_is_one_distance_and_angles_are_wrapped():
     assert position.rms == pytest.approx(math.sqrt((20 * 0.005**2 + 0.05**2) / 21))
     assert math.isnan(position.end)
     assert (psi.what, psi.most) == ("psi", pytest.approx(0.01))
-
-
-def test_an_error_at_the_end_has_its_standard_error():
-    noise = np.random.default_rng(0).normal(0.0, 0.016, (3, H + 1, 2))
-    runs = []
-    for one in noise:
-        states = off(0.1)
-        states[:, :2] += one
-        runs.append(run(states))
-    (alone,) = off_target_of(task(terminal=END), runs[:1])
-    assert alone.end_std == pytest.approx(0.016, rel=0.4) and alone.runs == 1
-    (several,) = off_target_of(task(terminal=END), runs)
-    ends = [np.hypot(*one.states[-1, :2]) for one in runs]
-    least = float(np.std(ends, ddof=1)) / 3**0.5
-    assert several.end_std >= least * 0.999 and several.runs == 3
-    (exact,) = off_target_of(task(terminal=END), [run(off(0.1))])
-    assert exact.end_std == pytest.approx(0.0, abs=1e-12)
 
 
 def test_status_and_ingest_say_the_number_of_the_page(cart, tmp_path):

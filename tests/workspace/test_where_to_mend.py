@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from cli import grounded
 from facts import holding
 from grounded.accounts.finding import Finding
 from grounded.errors import GroundedError
@@ -69,8 +68,7 @@ def test_a_late_sensor_of_our_own_trials_is_mended_in_the_program(w):
     own(w, late())
     one = found_in(w)
     assert (one.signal, one.corrected, one.log) == ("v", True, "") and one.advice
-    shown = grounded("-C", w.folder, "diagnose", "--instruments", "--json").json["preflight"]
-    assert shown[0]["advice"] == one.advice
+    assert one.to_json()["advice"] == one.advice
 
 
 def test_a_delay_is_not_removed_from_logs_that_the_model_has(w):

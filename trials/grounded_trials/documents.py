@@ -265,16 +265,9 @@ class ExplainJson(TypedDict):
     effects: dict[str, FamilyJson]
 
 
-class InstrumentsJson(TypedDict):
-    """`diagnose --instruments`."""
-
-    preflight: list[Fault]
-    unheld: list[str]
-
-
 DOCUMENTS: dict[str, Any] = {
     "adopt": Adopted | Undone,
-    "diagnose": Diagnosis | InstrumentsJson,
+    "diagnose": Diagnosis,
     "discard": SetAside,
     "excite": Excited,
     "explain": ExplainJson,

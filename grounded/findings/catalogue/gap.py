@@ -161,11 +161,6 @@ ENTRIES: dict[str, Entry] = {
         '[[term? or multiply each term of the rate of {state} by a Param(1.0, "1", 0.0, 2.0) and '
         "diagnose again: what comes far from 1 is why]]",
     ),
-    "next.undo": Entry(
-        "warn",
-        "the last {lost:candidate} planned with the adopted {about} lost",
-        f"undo the last adoption with `grounded adopt --undo`, {DIAGNOSE}",
-    ),
     "next.fix": Entry("warn", FIX),
     "next.probe": Entry(
         "note",

@@ -194,6 +194,6 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "{about}[[ {rms:size} rms, {most:size} at most (at {at} s)]][[also?,]]"
         "[[ {end:size} at the end]][[there?  none at the end]][[ at the end within its noise of "
-        "{noise:size}]][[ (+- {std:size} by {runs:run})]]",
+        "{noise:size}]]",
     ),
 }

@@ -118,8 +118,8 @@ ENTRIES: dict[str, Entry] = {
     "unknown": Entry(
         "refuse",
         "{about} is no {kind} of this [[unusable? task, by its length, states, inputs or dt]]"
-        "[[!unusable? workspace]][[; did you mean '{meant}'?]][[; beside it: "
-        "{beside}]][[; there are: {known}]]",
+        "[[!unusable? workspace]][[; did you mean '{meant}'?]][[; there are: "
+        "{known}]]",
     ),
     "no_trial": Entry(
         "refuse",

@@ -30,9 +30,7 @@ from grounded_trials.wording import rendered, shown
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import BEFORE_TRIALS, outlook
 from grounded_trials.workspace.off_target import (
-    UNSURE,
     OffTarget,
-    by_runs,
     off_target_of,
     tracking_error,
 )
@@ -257,9 +255,7 @@ def improvements_in(findings: Findings) -> list[Improved]:
             found.append(Improved(f"{what} off target, rms{note}", unit, first.rms, last.rms))
         if np.isfinite(last.end):
             least = last.noise  # a single sample can't show a smaller error
-            noise, std = (measured_alike([one], unit)[0] for one in (least, last.end_std))
-            unsure = f"; +- {std} {by_runs(last.runs)}" * (last.end_std > UNSURE * last.end)
-            doubt = f", noise {noise}" if last.end < least else unsure
+            doubt = f", noise {measured_alike([least], unit)[0]}" if last.end < least else ""
             ends = max(first.end, least), max(last.end, least)
             found.append(Improved(f"{what} off target, end{doubt}{note}", unit, *ends))
     return found[:SHOWN]

@@ -32,23 +32,20 @@ D = TypeVar("D", bound=Document)
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
-def write_document(
-    path: Path, document: Mapping[str, Any], *, nan: bool = False, indent: int | None = 1
-) -> None:
+def write_document(path: Path, document: Mapping[str, Any], *, nan: bool = False) -> None:
     """Write a JSON document with its checksum, atomically.
 
     Args:
         path: the file.
         document: the contents.
         nan: allow NaN and infinity, which are not JSON but which Python reads.
-        indent: of its lines; None: all on one, which is faster.
 
     Raises:
         GroundedError: if it can't be written.
         ValueError: if a number is not finite, unless `nan`.
     """
-    text = json.dumps(dict(document), indent=indent, ensure_ascii=False, allow_nan=nan)
-    rest = (text[1:] if indent else f"\n{text[1:]}").encode() + b"\n"
+    text = json.dumps(dict(document), indent=1, ensure_ascii=False, allow_nan=nan)
+    rest = text[1:].encode() + b"\n"
     digest = hashlib.sha256(rest).hexdigest()
     write_atomically(path, b'{\n "sha256": "' + digest.encode() + b'",' + rest)
 

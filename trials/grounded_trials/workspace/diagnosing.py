@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.accounts.finding import in_the_log
-from grounded.accounts.kinematics import unheld
 from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import gain, open_noise
+from grounded.diagnosis.error_report import open_noise
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
 from grounded.errors import GroundedError, NextCommand
@@ -24,7 +23,6 @@ from grounded.rollout import Rollout, simulate
 from grounded.search.candidate import Candidate
 from grounded.search.design import probe
 from grounded.search.safety import objections, spread
-from grounded.search.standing import LOST
 from grounded.share import Share
 from grounded_trials.workspace.adopted import installed_effects
 from grounded_trials.workspace.adoption import diagnosed_again
@@ -45,7 +43,6 @@ from grounded_trials.workspace.last_diagnosis import (
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
     EXPORT,
-    REPORT,
     after_diagnosis,
 )
 from grounded_trials.workspace.readings import one_message
@@ -164,15 +161,13 @@ def _with_next(
         wrong: the trials of candidates whose logs are at fault.
         whole: whether all trials could be used, if they had been named.
     """
-    undo = _in_vain(workspace, found)
-    found = found.asking(undo, identity) if undo else found
     if wrong:
         found = found.asking(finding("gap.next.fix", *wrong), identity)
     left = len(diagnosable(workspace)) - len(made_from(found).trials)
     if unasked := found.no_cause and left > 0 and whole:
         found = found.asking(finding("gap.next.record", stored=left))
     write_diagnosis(workspace.reports, found)  # again, now with the next step
-    then = REPORT if undo else DIAGNOSE if unasked else after_diagnosis(workspace, found)
+    then = DIAGNOSE if unasked else after_diagnosis(workspace, found)
     then = NextCommand("discard", wrong) if wrong else then
     if then == EXPORT and _left_open(found):
         best = candidate_named(workspace, "best")
@@ -202,24 +197,6 @@ def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
     )
 
 
-def _in_vain(workspace: Folder, found: Diagnosis) -> Finding | None:
-    """Suggest undoing an adoption if later candidates lost in a row for no known cause.
-
-    If predictions are better with the adopted effects than before, the losses have another cause.
-    """
-    names = [str(effect["name"]) for effect in workspace.config.model.effects]
-    paid = gain(found.prediction_error, "outset", "crude") > 0
-    claims = found.kind in ("effect", "several")
-    if not names or found.no_cause or claims or not _left_open(found) or paid:
-        return None
-    lost, model = 0, workspace.planner.fingerprint
-    for tried in reversed(standing_in(workspace).history):
-        if tried.accepted or tried.candidate.model != model:
-            break
-        lost += tried.accepted is False
-    return finding("gap.next.undo", *names, lost=lost) if lost >= LOST else None
-
-
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault, ...]:
     """Check the instruments (sensors, clocks, units) in the stored trials, without the physics."""
     planner = workspace.planner
@@ -228,11 +205,6 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault
     lifted, together = [planner.lift(trial) for trial in used], one_message(workspace)
     found = sound_trials(planner.plan, lifted, memory, one_message=together)
     return where_to_mend(workspace, used, found.findings)
-
-
-def unheld_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[str, ...]:
-    """Return the logged states that no other sensor in the trials can check, see `unheld`."""
-    return unheld(workspace.planner.task.model, chosen(workspace, trials).trials)
 
 
 def unwritten_in(workspace: Folder) -> list[Finding]:

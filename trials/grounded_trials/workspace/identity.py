@@ -309,45 +309,25 @@ _SHORT = re.compile(r"[ct]?0*(\d{1,9})", re.IGNORECASE)  # t2, T0002 or 2
 
 def unknown_trial(workspace: Folder, name: str) -> GroundedError:
     """Return the error for a name that is no stored trial, or that of one that is set aside."""
-    return _unknown(workspace, name, "trial")
+    given, aside = name.lower(), workspace.discarded()
+    if given in aside:
+        then = NextCommand("restore", (given,))
+        return GroundedError(found("search.aside", given, then=then, why=aside[given]))
+    return _unknown(name, "trial", [one.id for one in workspace.store.list()])
 
 
 def unknown_candidate(workspace: Folder, name: str) -> GroundedError:
     """Return the error for a name that is no candidate."""
-    return _unknown(workspace, name, "candidate")
+    return _unknown(name, "candidate", workspace.candidate_ids())
 
 
-def _unknown(workspace: Folder, name: str, kind: str) -> GroundedError:
-    """Return the error for a name of the other kind, one that is set aside, or one of nothing.
-
-    Args:
-        workspace: the workspace.
-        name: the name that was given.
-        kind: "trial" or "candidate", which was expected.
-    """
-    given, aside = name.lower(), workspace.discarded()
-    trials, candidates = [one.id for one in workspace.store.list()], workspace.candidate_ids()
-    if kind == "trial" and given in aside:
-        then = NextCommand("restore", (given,))
-        return GroundedError(found("search.aside", given, then=then, why=aside[given]))
-    known, other = (trials, candidates) if kind == "trial" else (candidates, trials)
-    beside = None
-    if given in other and given not in known:
-        pairs = ((t.trial.candidate, t.stored.id) for t in workspace.whole_trials())
-        own = [b if kind == "trial" else a for a, b in pairs if given in (a, b)]
-        beside = ranges([one for one in own if one]) or "none"
-    short = _SHORT.fullmatch(given)
+def _unknown(name: str, kind: str, known: Sequence[str]) -> GroundedError:
+    short = _SHORT.fullmatch(name)
     meant = f"{kind[0]}{int(short[1]):04d}" if short else ""
-    return GroundedError(
-        found(
-            "search.unknown",
-            name,
-            kind=kind,
-            beside=beside,
-            meant=meant if meant in known and not beside else None,
-            known=None if beside or meant in known else ranges(known) or "none yet",
-        )
-    )
+    if meant in known:
+        return GroundedError(found("search.unknown", name, kind=kind, meant=meant))
+    there = ranges(known) or "none yet"
+    return GroundedError(found("search.unknown", name, kind=kind, known=there))
 
 
 def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str]) -> tuple[str, ...]:

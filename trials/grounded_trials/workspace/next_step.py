@@ -31,7 +31,6 @@ DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 BEFORE_TRIALS = ("adopt", "fit", "discard")  # verbs of commands that come before another trial
-TRUE = 0.05  # of a utility: a prediction that misses by less came true
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,32 +98,6 @@ class Situation:
         return bool(self.now.doubt) and new >= LOST
 
     @property
-    def of_another_model(self) -> bool:
-        """Whether a gap was found in another model, of which nothing is adopted any more.
-
-        That is so after `adopt --undo`, which often precedes a better model.py.
-        """
-        model, found = self.workspace.config.model, self.diagnosis
-        kept = model.effects or model.params
-        gap = found is not None and found.kind != "none"
-        return self.since.changed and not kept and self.since.usable > 0 and gap
-
-    @property
-    def came_true(self) -> bool:
-        """Whether a search has ended as predicted, with all adopted that was found before.
-
-        A diagnosis of that model would then find little.
-        """
-        best, here = self.now.incumbent, self.workspace
-        adopted = {str(effect["name"]) for effect in here.config.model.effects}
-        found = {*self.diagnosis.effects} if self.diagnosis else set[str]()
-        if not found or not found <= adopted or self.now.doubt or self.now.then or best is None:
-            return False
-        missed = abs(best.promised - best.utility)
-        same = best.candidate.model == here.planner.fingerprint
-        return same and missed <= TRUE * abs(best.utility)
-
-    @property
     def run(self) -> NextCommand:
         """One more trial: of the candidate that waits, the next or the best."""
         now, best = self.now, self.now.incumbent
@@ -171,12 +144,10 @@ NEXT: tuple[Row, ...] = (
         ),
         lambda s: DIAGNOSE,
     ),
-    # newer logs, another model or the search's doubt ask for another diagnosis
+    # newer logs or the search's doubt ask for another diagnosis
     (
         PLANNING,
-        lambda s: (
-            s.diagnosis and ((s.adopt and not s.now.history) or s.of_another_model or s.doubted)
-        ),
+        lambda s: s.diagnosis and ((s.adopt and not s.now.history) or s.doubted),
         lambda s: DIAGNOSE,
     ),
     (PLANNING, lambda s: s.nothing_known and undrawn(s.workspace), lambda s: s.record),
@@ -184,7 +155,7 @@ NEXT: tuple[Row, ...] = (
     # an ended search was not diagnosed with all of its trials and its model
     (
         ENDED,
-        lambda s: s.diagnosis and not (s.since.settled or s.came_true),
+        lambda s: s.diagnosis and not s.since.settled,
         lambda s: DIAGNOSE,
     ),
     # another run of the best candidate may tell a cause

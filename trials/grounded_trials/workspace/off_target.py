@@ -29,7 +29,6 @@ from grounded_trials.workspace.user_files.task_file import equal_weights
 GROUPS_TOLD = 2
 EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
-UNSURE = 0.05  # of an error at the end: a larger standard error is told beside it
 # of the highest speed: below it a path's radius is not computed from its samples
 SPEED_OF_RADIUS = 0.5
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
@@ -48,8 +47,6 @@ class OffTarget(Document):
         end: rms of the errors at the last state; NaN if a run ended early, or if the end has no
             weight of its own and nothing is to be reached (see `reaches`).
         noise: std of the noise of a single sample, below which an error at the end says nothing.
-        end_std: standard error of `end`, see `std_at_end`.
-        runs: number of runs.
     """
 
     what: str
@@ -59,8 +56,6 @@ class OffTarget(Document):
     at_s: float = float("nan")
     end: float = float("nan")
     noise: float = 0.0
-    end_std: float = 0.0
-    runs: int = 1
 
     @property
     def finding(self) -> Finding:
@@ -74,8 +69,6 @@ class OffTarget(Document):
                 told |= {"noise": size(self.noise)}
             else:
                 told |= {"end": size(at_end)} if at_end else {"there": 1}
-                unsure = self.end_std > UNSURE * at_end
-                told |= {"std": size(self.end_std), "runs": self.runs} if unsure else {}
             told |= {"also": int("rms" in told)}
         return found("run.off_target", self.what, **told)
 
@@ -111,10 +104,9 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
         if (terminal.any() or reaches(task)) and not ended:
             values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
-            values["end_std"] = std_at_end([e[-1] for e in each], noise)
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
         unit = task.model.states[names[0]]
-        found[k] = cost, OffTarget(what.removeprefix("the "), unit, **values, runs=len(each))
+        found[k] = cost, OffTarget(what.removeprefix("the "), unit, **values)
     told = sorted(found, key=lambda k: (_is_rate(task, k), -found[k][0]))[:GROUPS_TOLD]
     dear = max(found, key=lambda k: found[k][0], default=-1)
     return tuple(one for k, (_, one) in found.items() if k in {*told, dear})
@@ -124,30 +116,6 @@ def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
     """Return the noise (std) of one sample of each of some states, (k,), rms over runs."""
     each = [trial.noise(trial.finite_steps + 1) for trial in trials]
     return np.asarray(np.sqrt(np.mean(np.square(each), axis=0))[list(states)])
-
-
-def std_at_end(ends: Sequence[Array], noise: Array) -> float:
-    """Return the standard error of the distance to the target at the end.
-
-    An error at the end is one sample of each run. Of a single run its sensors' noise is known,
-    which leaves out how much runs differ; of several the scatter of their ends, if that is more.
-
-    Args:
-        ends: the error at the end of each run (k,).
-        noise: that of one sample of each of the k states, see `reading_noise`.
-    """
-    far = np.linalg.norm(ends, axis=1)
-    toward = np.array(ends) / np.where(far > 0, far, 1.0)[:, None]
-    toward[far == 0] = len(noise) ** -0.5
-    single = float(np.sqrt(np.mean(toward**2 @ noise**2)))
-    scatter = float(far.std(ddof=1)) if len(far) > 1 else 0.0
-    return float(max(single, scatter) / len(far) ** 0.5)
-
-
-def by_runs(runs: int, *, each: bool = False) -> str:
-    """Return what the standard error of an error at the end rests on; `each` of several such."""
-    told = "by noise alone, from one run" if runs == 1 else f"by {runs} runs"
-    return told + " each" * each
 
 
 def _is_rate(task: Task, group: int) -> bool:

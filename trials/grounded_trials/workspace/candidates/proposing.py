@@ -225,7 +225,6 @@ def _told(
     cost = same[0].noise_missed if same else noise_missed(task, made, noise)
     whole = noise_cost(task, made.policy, noise)
     ahead = off_target_of(task, [made.predicted_run])
-    ahead = tuple(replace(one, end_std=0.0) for one in ahead)  # no log's last sample
     if not made.grounded:  # a run that no sensor measured
         ahead = tuple(replace(one, noise=0.0) for one in ahead)
     best, again = now.incumbent, any(t.trials for t in same)
