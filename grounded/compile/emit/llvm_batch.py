@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
-from grounded.compile.emit.llvm_text import Writer, columns_of
+from grounded.compile.emit.llvm_text import Writer
 from grounded.compile.kernel_words import BATCH, MARCH
 
 
@@ -76,8 +76,8 @@ def gather_rows(
         index.append(f.pick(f.compare_integers("sgt", i, last), last, i))
     for base, size, out in arrays:
         rows = [f.at(base, f.integer("mul", i, size)) for i in index]
-        for j, column in enumerate(columns_of(f, rows, size)):
-            f.store(column, out, j * width, width)
+        for j in range(size):
+            f.store(f.vector_of([f.load(row, j) for row in rows]), out, j * width, width)
 
 
 def _each_sample(

@@ -27,12 +27,6 @@ class Uniforms:
         read = [i for i in _frontier(graph, live, varying, outputs) if graph.nodes[i].op != "const"]
         self.slot = {i: FIRST + place for place, i in enumerate(read)}
 
-    def held(self, outputs: Sequence[int]) -> list[int]:
-        """Nodes of the inputs alone that outputs use: the same in every stage of a step."""
-        live = self.graph.live(outputs)
-        moving = {i for i in live if self.graph.varies(i, "x")}
-        return [i for i in _frontier(self.graph, live, moving, outputs) if self.graph.varies(i)]
-
     @property
     def size(self) -> int:
         """Doubles in the table."""
@@ -76,25 +70,22 @@ class Body:
         leaf: Callable[[str, int], str],
         table: str,
         slots: Mapping[int, int],
-        known: Mapping[int, str] | None = None,
         packed: bool = False,
     ) -> None:
         self.f, self.width, self.graph, self.leaf = f, width, graph, leaf
         self.table, self.slots = table, slots
         self.lanes = Lanes(f, width)
-        self._known: dict[int, str] = dict(known or {})
+        self._known: dict[int, str] = {}
         self._settings: dict[int, str] = {}
         self.packed = packed
         self._alike: dict[int, list[int]] = {}  # arguments that are computed together
-        turns = (node.args[0] for node in graph.nodes if node.op in ("sin", "cos", "tan"))
-        self._turned = {i for i in turns if graph.nodes[i].op == "atan2"}  # its sine comes with it
         self._exact = False  # whether the node that is being written is never smoothed
 
     def values(self, outputs: Sequence[int]) -> list[str]:
-        """Value names of outputs, those written first that the most has to wait for."""
+        """Value names of outputs."""
         wanted = self._unknown(outputs)
         self._find_alike(wanted)
-        self._write(self._urgent(wanted))
+        self._write(sorted(wanted))
         return [self._known[i] for i in outputs]
 
     def _unknown(self, outputs: Sequence[int]) -> set[int]:
@@ -107,19 +98,6 @@ class Body:
                 if i not in self.slots:
                     stack.extend(self.graph.nodes[i].args)
         return wanted
-
-    def _urgent(self, nodes: set[int]) -> list[int]:
-        """Nodes in topological order, by the cycles that it takes from there to the last output.
-
-        The machine looks only so far ahead, and of what is ready it takes what comes first.
-        """
-        cycles = {i: CYCLES.get(self.graph.nodes[i].op, USUAL) for i in nodes}
-        left = dict(cycles)
-        for i in sorted(nodes, reverse=True):
-            for a in self.graph.nodes[i].args:
-                if a in nodes:
-                    left[a] = max(left[a], left[i] + cycles[a])
-        return sorted(nodes, key=lambda i: (-left[i], i))
 
     def _write(self, nodes: Sequence[int]) -> None:
         for i in nodes:
@@ -144,9 +122,8 @@ class Body:
             if i in self.slots or node.op not in TOGETHER:
                 continue
             (argument,) = node.args
-            if node.op == "exp" or argument not in self._turned:
-                group = groups.setdefault((depth[i], node.op == "exp"), {})
-                group.setdefault(argument, []).append(i)
+            group = groups.setdefault((depth[i], node.op == "exp"), {})
+            group.setdefault(argument, []).append(i)
             depth[i] += 1
         for group in groups.values():
             arguments = list(group)
@@ -190,8 +167,6 @@ class Body:
         self._exact = not self.graph.varies(i)
         if node.op in PLAIN:
             return f.op(PLAIN[node.op], args[0], args[1], w)
-        if node.op == "atan2":
-            return self.lanes.atan2(args[0], args[1], i in self._turned)
         if node.op in INTRINSIC:
             return f.call(INTRINSIC[node.op], args, w)
         return (
@@ -310,8 +285,6 @@ class Body:
 
 
 TOGETHER, MOST = ("sin", "cos", "exp"), 4  # what is computed side by side, and how many at most
-USUAL = 4  # cycles of most operations, about
-CYCLES = {"div": 14, "sqrt": 18, "sin": 40, "cos": 40, "exp": 45, "atan2": 50, "asin": 45}
 PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 INTRINSIC = {"sqrt": "sqrt", "floor": "floor", "rint": "rint", "trunc": "trunc"}
 WRITTEN: dict[str, Callable[..., str]] = {
@@ -321,6 +294,7 @@ WRITTEN: dict[str, Callable[..., str]] = {
     "tan": Body.tan,
     "exp": lambda b, x: b.lanes.exp(x),
     "tanh": lambda b, x: b.lanes.tanh(x),
+    "atan2": lambda b, y, x: b.lanes.atan2(y, x),
     "atan": lambda b, x: b.lanes.atan2(x, b.const(1.0)),
     "asin": lambda b, x: b.lanes.asin(x),
     "acos": lambda b, x: b.lanes.acos(x),

@@ -74,7 +74,7 @@ class Lanes:
 
     def const(self, value: float) -> str:
         """A constant in every lane."""
-        return self.f.constant(value, self.width) if value else splat(value, self.width)
+        return splat(value, self.width)
 
     def polynomial(self, x: str, coefficients: tuple[float, ...]) -> str:
         """c0 + c1 x + c2 x^2 ... by Estrin's scheme, which shortens the chain of dependences."""
@@ -88,14 +88,6 @@ class Lanes:
             if len(terms) > 1:
                 x = f.mul(x, x, w)
         return terms[0]
-
-    def series(self, first: str, factor: str, x: str, coefficients: tuple[float, ...]) -> str:
-        """Sum first + factor (c0 + c1 x + c2 x^2 ...) of 5 to 12 terms, by a shorter chain."""
-        f, w = self.f, self.width
-        square = f.mul(x, x, w)
-        fourth = f.mul(square, square, w)
-        low = f.fma(factor, self.polynomial(x, coefficients[:4]), first, w)
-        return f.fma(f.mul(factor, fourth, w), self.polynomial(x, coefficients[4:]), low, w)
 
     def _bits(self, value: str) -> str:
         return self.f.emit(f"bitcast {vector(self.width)} {value} to {self.whole}")
@@ -127,16 +119,12 @@ class Lanes:
             r = x
             for part in HALF_PI:
                 r = f.sub(r, f.mul(turns, self.const(part), w), w)
-            self.angles[x] = self._quadrant(shifted, *self._sincos_within(r))
+            z = f.mul(r, r, w)
+            sine = f.fma(f.mul(z, r, w), self.polynomial(z, SIN), r, w)
+            half = f.fma(z, self.const(-0.5), self.const(1.0), w)
+            cosine = f.fma(f.mul(z, z, w), self.polynomial(z, COS), half, w)
+            self.angles[x] = self._quadrant(shifted, sine, cosine)
         return self.angles[x]
-
-    def _sincos_within(self, r: str) -> tuple[str, str]:
-        """Sine and cosine of an angle in [-pi/4, pi/4]."""
-        f, w = self.f, self.width
-        z = f.mul(r, r, w)
-        sine = f.fma(f.mul(z, r, w), self.polynomial(z, SIN), r, w)
-        half = f.fma(z, self.const(-0.5), self.const(1.0), w)
-        return sine, f.fma(f.mul(z, z, w), self.polynomial(z, COS), half, w)
 
     def _quadrant(self, shifted: str, sine: str, cosine: str) -> tuple[str, str]:
         f, w = self.f, self.width
@@ -167,7 +155,7 @@ class Lanes:
         r = f.sub(x, f.mul(n, self.const(LN2[0]), w), w)
         r = f.sub(r, f.mul(n, self.const(LN2[1]), w), w)
         start = f.add(r, self.const(1.0), w)
-        mantissa = self.series(start, f.mul(r, r, w), r, EXP)
+        mantissa = f.fma(f.mul(r, r, w), self.polynomial(r, EXP), start, w)
         exponent = self._bitwise("shl", self._bits(shifted), 52)
         return self._from_bits(f.emit(f"add {self.whole} {self._bits(mantissa)}, {exponent}"))
 
@@ -179,30 +167,16 @@ class Lanes:
         size = f.div(f.sub(one, e, w), f.add(one, e, w), w)
         return f.select(f.compare("olt", x, self.const(0.0), w), f.neg(size, w), size, w)
 
-    def atan2(self, y: str, x: str, turned: bool = False) -> str:
-        """The angle of (x, y) in (-pi, pi].
-
-        Mostly it is a small one in every lane, and what the others need is left out.
-
-        Args:
-            y: the numerator.
-            x: the denominator.
-            turned: whether its sine and cosine are wanted too, see `sincos`.
-        """
+    def atan2(self, y: str, x: str) -> str:
+        """The angle of (x, y) in (-pi, pi]; if it is small in all lanes, without the rest."""
         f, w = self.f, self.width
-
-        def small() -> list[str]:
-            angle = self._arctangent(f.div(y, x, w))
-            return [angle, *(self._sincos_within(angle) if turned else ())]
-
-        def any_angle() -> list[str]:
-            angle = self._any_angle(y, x)
-            return [angle, *(self.sincos(angle) if turned else ())]
-
-        near = f.compare("olt", f.call("fabs", [y], w), self._eighth(x), w)
-        angle, *others = f.either(f.all(near, w), small, any_angle, w)
-        if turned:
-            self.angles[angle] = others[0], others[1]
+        size = f.call("fabs", [y], w)
+        (angle,) = f.either(
+            f.all(f.compare("olt", size, self._eighth(x), w), w),
+            lambda: [self._arctangent(f.div(y, x, w))],
+            lambda: [self._any_angle(y, x)],
+            w,
+        )
         return angle
 
     def _any_angle(self, y: str, x: str) -> str:
@@ -246,7 +220,7 @@ class Lanes:
         """The arctangent of t in [-tan(pi / 8), tan(pi / 8)]."""
         f, w = self.f, self.width
         z = f.mul(t, t, w)
-        return self.series(t, f.mul(t, z, w), z, ATAN)
+        return f.fma(f.mul(t, z, w), self.polynomial(z, ATAN), t, w)
 
     def _octant(self, far: str, steep: str, left: str) -> tuple[str, str]:
         """(base, turn): the whole angle is base + turn * small angle."""

@@ -18,8 +18,6 @@ from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer, splat
 from grounded.compile.kernel_words import ROLLOUT, Layout
 
-CHAINS = 4  # partial sums of a sum
-
 
 def wrap(f: Writer, d: str, width: int) -> str:
     """An angle's difference in [-pi, pi]."""
@@ -96,16 +94,11 @@ class _Rollout:
         self.f.store(value, base, i * self.lanes, self.lanes)
 
     def _sum(self, factors: list[tuple[str, str]]) -> str:
-        """The sum of products, in chains that don't wait for each other."""
-        f, sums = self.f, [""] * CHAINS
-        for i, (a, b) in enumerate(factors):
-            old = sums[i % CHAINS]
-            sums[i % CHAINS] = f.fma(a, b, old, self.lanes) if old else f.mul(a, b, self.lanes)
-        parts = [value for value in sums if value]
-        while len(parts) > 1:
-            pairs = zip(parts[::2], parts[1::2], strict=False)
-            parts = [f.add(a, b, self.lanes) for a, b in pairs] + parts[len(parts) // 2 * 2 :]
-        return parts[0]
+        """The sum of products."""
+        total = self.f.mul(*factors[0], self.lanes)
+        for a, b in factors[1:]:
+            total = self.f.fma(a, b, total, self.lanes)
+        return total
 
     def _add_cost(self, terms: list[tuple[str, str]]) -> None:
         """Adds the sum of weight * error^2."""

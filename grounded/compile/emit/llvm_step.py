@@ -119,7 +119,6 @@ class StepWriter:
         self.u = f.room(d.m * width)
         self.next = f.room(d.n * width)
         self.k = f.room(d.n * width) if d.stages else ""
-        self.held: dict[int, str] = {}  # values of the inputs alone, the same in every stage
 
     def _body(self, state: Callable[[int], str]) -> Body:
         f, d, w = self.f, self.d, self.width
@@ -129,7 +128,7 @@ class StepWriter:
                 return f.load_all(self.table, DT, w)
             return state(index) if letter == "x" else f.load(self.u, index * w, w)
 
-        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, self.held, packed=not d.short)
+        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, packed=not d.short)
 
     def step(self) -> list[str]:
         """From x and u to next, whose values are returned too."""
@@ -139,7 +138,7 @@ class StepWriter:
         elif d.short:
             following = self._flat()
         else:
-            self._start(d.outputs)
+            self._start()
             with f.loop(len(d.stages)) as stage:
                 self._rates(stage)
             return self._finish()
@@ -150,7 +149,6 @@ class StepWriter:
     def _flat(self) -> list[str]:
         """The stages one after the other, the sums of `_rates` and `_finish` in registers."""
         f, d, w = self.f, self.d, self.width
-        self._hold(d.outputs)
         dt, x = f.load(self.table, DT), [f.load(self.x, i * w, w) for i in range(d.n)]
         now, k, total = x, list[str](), list[str]()
         for c, b in d.stages:
@@ -165,14 +163,8 @@ class StepWriter:
             ]
         return [f.add(a, b, w) for a, b in zip(x, total, strict=True)]
 
-    def _hold(self, outputs: Sequence[int]) -> None:
-        held = self.d.uniforms.held(outputs)
-        self.held = {}
-        self.held = dict(zip(held, self._body(lambda i: "").values(held), strict=True))
-
-    def _start(self, outputs: Sequence[int]) -> None:
+    def _start(self) -> None:
         f, d, w = self.f, self.d, self.width
-        self._hold(outputs)
         zero = splat(0.0, w)
         for i in range(d.n):
             f.store(zero, self.next, i * w, w)
@@ -210,7 +202,7 @@ class StepWriter:
             for e, value in enumerate(body.values([d.entries[p] for p in d.places])):
                 f.store(value, out, e * w, w)
             return
-        self._start([*d.outputs, *d.entries.values()])
+        self._start()
         self._stages(out)
         self._finish()
         for e in range(len(d.rates), len(d.places)):

@@ -42,7 +42,6 @@ class Writer:
         self.lines = [f"define {signature} {{", "entry:"]
         self._count = 0
         self._allocas = len(self.lines)
-        self._constants: dict[str, str] = {}
 
     def name(self) -> str:
         """A fresh value name."""
@@ -72,18 +71,6 @@ class Writer:
         self.lines.insert(self._allocas, line)
         self._allocas += 1
         return result
-
-    def constant(self, value: float, width: int) -> str:
-        """A constant in every lane, read from the stack.
-
-        An instruction reads it there by itself; where the code itself holds it, an address that can
-        be anywhere comes first.
-        """
-        bits = number(value)
-        if bits not in self._constants:
-            self._constants[bits] = place = self.room(1, align=8)
-            self.lines.insert(self._allocas, f"  store double {bits}, ptr {place}, align 8")
-        return self.load_all(self._constants[bits], 0, width)
 
     def at(self, base: str, index: int | str, kind: str = F) -> str:
         """The address of an element."""
@@ -317,20 +304,6 @@ def transposed(f: Writer, a: list[str]) -> list[str]:
             columns[2 * half + parity] = shuffled(f, upper, lower, 8, first)
             columns[2 * half + parity + 4] = shuffled(f, upper, lower, 8, second)
     return columns
-
-
-def columns_of(f: Writer, rows: list[str], size: int) -> list[str]:
-    """Columns of W arrays of `size` doubles, rows their addresses, as vectors of W; W is 4 or 8."""
-    width, found = len(rows), list[str]()
-    for at in range(0, size - size % width, width):
-        found += transposed(f, [f.load(row, at, width) for row in rows])
-    if width == 8 and size - len(found) >= 4:
-        at = len(found)
-        halves = [transposed(f, [f.load(row, at, 4) for row in rows[i : i + 4]]) for i in (0, 4)]
-        found += [shuffled(f, a, b, 4, range(8)) for a, b in zip(*halves, strict=True)]
-    for at in range(len(found), size):
-        found.append(f.vector_of([f.load(row, at) for row in rows]))
-    return found
 
 
 def shuffled(f: Writer, a: str, b: str, width: int, lanes: Sequence[int]) -> str:

@@ -46,13 +46,11 @@ from grounded.compile.problem import (
 from grounded.compile.run import jit
 from grounded.compile.run.arguments import (
     address,
-    empty,
     packed,
     plain,
     run,
     side_by_side,
     table,
-    zeros,
 )
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
@@ -153,7 +151,7 @@ class CompiledSystem(TracedSystem):
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`."""
-        out = empty((len(x), self.n))
+        out = np.empty((len(x), self.n))
         library = self._compiled(p, dt).batch()
         self._batch(library["step"], (x, u, p, dt, smoothing), {"out": out})
         return out
@@ -185,7 +183,7 @@ class CompiledSystem(TracedSystem):
         """See `System.linearise`."""
         x, u, p, dt, smoothing, _ = at
         N, n = len(x), self.n
-        f_x, f_u = zeros((N, n, n)), zeros((N, n, self.m))
+        f_x, f_u = np.zeros((N, n, n)), np.zeros((N, n, self.m))
         library = self._compiled(p, dt).batch()
         self._batch(library["linearise"], (x, u, p, dt, smoothing), {"f_x": f_x, "f_u": f_u})
         return f_x, f_u
@@ -199,7 +197,7 @@ class CompiledSystem(TracedSystem):
             self._too_long.add(self.n + self.m + self.k)
             return super().sensitivities(x, u, p, dt, smoothing)
         N, n = len(x), self.n
-        f_x, f_u, f_p = zeros((N, n, n)), zeros((N, n, self.m)), zeros((N, n, self.k))
+        f_x, f_u, f_p = np.zeros((N, n, n)), np.zeros((N, n, self.m)), np.zeros((N, n, self.k))
         out = {"f_x": f_x, "f_u": f_u, "f_p": f_p}
         self._batch(full["linearise"], (x, u, p, dt, smoothing), out)
         return f_x, f_u, f_p
@@ -228,7 +226,7 @@ class CompiledSystem(TracedSystem):
     def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
         """See `System.rollout`."""
         runs, H, nz = len(alphas), problem.horizon, problem.nz
-        z, u, cost = empty((runs, H + 1, nz)), empty((runs, H, self.m)), np.empty(runs)
+        z, u, cost = np.empty((runs, H + 1, nz)), np.empty((runs, H, self.m)), np.empty(runs)
         known, lanes = packed(problem), np.empty(LANES)
         values = _policy(by) | {"alphas": lanes}
         kernel = self._search(problem)[0]["rollout" if runs == 1 else "rollouts"]
@@ -250,7 +248,7 @@ class CompiledSystem(TracedSystem):
         if into is not None and into.K.shape == (H, self.m, nz):
             k, K = into.k, into.K
         else:
-            k, K = empty((H, self.m)), empty((H, self.m, nz))
+            k, K = np.empty((H, self.m)), np.empty((H, self.m, nz))
         values = {"z_run": plain(z), "u_run": plain(u), "damping": plain(damping)}
         values |= {"k": k, "K": K, "expected": expected}
         library, jacobian = self._search(problem)
