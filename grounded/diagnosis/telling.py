@@ -59,17 +59,11 @@ def sentence(one: Finding) -> str:
     return f"{text[:1].upper() if own else text[:1]}{text[1:]}."
 
 
-def told(diagnosis: Diagnosis, now: str = "with_effects", before: str = "crude") -> Told:
-    """Return what is told of a diagnosis.
-
-    Args:
-        diagnosis: what was found.
-        now: the column of `RulerRow` with the errors of the model that is told.
-        before: the column of those before.
-    """
+def told(diagnosis: Diagnosis) -> Told:
+    """Return what is told of a diagnosis."""
     rows, header = cause_table(diagnosis)
     rest = settle(one for one in diagnosis.findings if not one.code.startswith(NEXT))
-    lines = (_what(diagnosis), *errors_line(diagnosis, now, before), *open_line(diagnosis))
+    lines = (_what(diagnosis), *errors_line(diagnosis), *open_line(diagnosis))
     if diagnosis.no_cause:  # what was fitted then means nothing
         lines, rows = lines[:1], ()
     return Told(lines, rows, header, rest, diagnosis.next_trial)
@@ -122,14 +116,14 @@ def _what(d: Diagnosis) -> Finding:
     return found("gap.none", known=known and not excess(d.prediction_error), adopted=adopted)
 
 
-def errors_line(d: Diagnosis, now: str, before: str) -> Iterator[Finding]:
+def errors_line(d: Diagnosis) -> Iterator[Finding]:
     """How far predictions are off, and were."""
     if (row := telling(d.prediction_error)) is None:
         return
     names = states_told(row, d.tracked)
     facts: dict[str, Any] = {}
     for end, name in zip(("", "2"), names, strict=False):
-        facts |= errors(row, name, **{f"now{end}": now, f"before{end}": before})
+        facts |= errors(row, name, **{f"now{end}": "with_effects", f"before{end}": "crude"})
         pair = [facts.get(f"{slot}{end}", Quantity(math.nan)) for slot in ("now", "before")]
         if len({measured(one.value, one.unit) for one in pair}) == 1:
             facts.pop(f"before{end}", None)
@@ -144,7 +138,7 @@ def errors_line(d: Diagnosis, now: str, before: str) -> Iterator[Finding]:
         state2=names[1] if len(names) > 1 else None,
         whole=row.whole_trial,
         ahead=0.0 if row.whole_trial else row.horizon_s,
-        who="it" if now == "with_effects" and d.verdict.causes else "the model",
+        who="it" if d.verdict.causes else "the model",
         bound="yes" if row.floor_bound else "no",
         inside=row.held_out == "no",
         **facts,

@@ -30,7 +30,7 @@ from grounded.diagnosis.validation.certainty import (
 )
 from grounded.diagnosis.validation.decide import Decision
 from grounded.diagnosis.validation.identifiable import Identified, identified, values_of
-from grounded.diagnosis.validation.limits import Limits, constant_inputs
+from grounded.diagnosis.validation.limits import Limits, excitation
 from grounded.diagnosis.validation.measured import Measured
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect, Library
@@ -77,7 +77,7 @@ class Claims:
         self.blamed = self.moved if calibrating else ()
         self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
-        self.one_clock = one_clock(self.data.model, late, ruler.names, constant_inputs(self.data))
+        self.one_clock = one_clock(self.data.model, late, ruler.names, excitation(self.data).still)
 
     def _known(self, off: Sequence[Blame]) -> tuple[Blame, ...]:
         """Return the parameters that are off by as much as trials agree on, if one clearly is.

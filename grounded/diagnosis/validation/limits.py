@@ -143,10 +143,11 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     if data.steps < FEW_STEPS:
         told.append(found("model.few", steps=data.steps, needed=FEW_STEPS))
         no_cause = True
-    still, unmoved = constant_inputs(data), still_states(data)
-    if still or unmoved:
-        told.append(found("model.still", *still, *unmoved))
-    no_cause |= len(still) == model.m and not released(data)
+    moved = excitation(data)
+    if moved.still or moved.unmoved:
+        told.append(found("model.still", *moved.still, *moved.unmoved))
+    # where all commands were 0, as in a free swing, no actuator stands behind what is seen
+    no_cause |= len(moved.still) == model.m and bool(data.commands.any())
     if data.skipped:
         used = len(data.valid)
         told.append(found("model.share", used=used, total=used + data.skipped, stretches=True))
@@ -155,7 +156,7 @@ def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
     spared = {*left_out, *(names[i] for i, log in data.behind.items() if names[log] in left_out)}
     if missing := [name for name in empty if name not in spared]:
         told.append(found("model.unmeasured", *missing))
-    no_cause |= {*unmoved, *empty, *(names[i] for i in data.hidden)} == {*names}
+    no_cause |= {*moved.unmoved, *empty, *moved.memory} == {*names}
     return Limits(tuple(told), no_cause)
 
 
@@ -180,58 +181,82 @@ def counted_once(trials: Sequence[Trial]) -> tuple[list[Trial], list[Finding]]:
 
 def _is_copy(trial: Trial, other: Trial) -> bool:
     """Check whether two trials of one length have the same states and inputs up to rounding."""
-    for a, b in ((trial.states, other.states), (trial.inputs, other.inputs)):
-        size = np.max(np.abs(b), axis=0, where=np.isfinite(b), initial=0.0)
-        if not np.allclose(a[-1], b[-1], rtol=0.0, atol=ROUNDING * size.max(), equal_nan=True):
-            return False  # cheap, and true of almost all pairs
-        off = np.abs(a - b) <= ROUNDING * size
-        if not np.all(off | (np.isnan(a) & np.isnan(b))):
-            return False
-    return True
+
+    def same(a: Array, b: Array) -> bool:
+        off = ROUNDING * np.max(np.abs(b), axis=0, where=np.isfinite(b), initial=0.0)
+        return np.allclose(a, b, rtol=0.0, atol=off, equal_nan=True)
+
+    return same(trial.states, other.states) and same(trial.inputs, other.inputs)
 
 
-def constant_inputs(data: Data) -> list[str]:
-    """Return the inputs with one value in all trials."""
-    names = data.model.input_names
-    return [
-        name
-        for j, name in enumerate(names)
-        if float(
-            np.ptp(np.concatenate([data.commands[i, :T, j] for i, T in enumerate(data.lengths)]))
-        )
-        <= ROUNDING * max(data.scales.peak(name), 1e-12)
-    ]
+@dataclass(frozen=True)
+class Excitation:
+    """What moved in the trials: names of inputs and states.
 
-
-def released(data: Data) -> bool:
-    """Check whether all commands were 0 throughout, as in a free swing or when coasting to rest.
-
-    No actuator can stand behind what such a motion shows, so its causes can be named.
+    Attributes:
+        still: inputs with one value.
+        on_off: inputs that were only on or off, whose effects on the amplitude can't be known.
+        sent: {input: those with the same commands up to a factor, itself included}.
+        same: those of them that also move all states alike, so no trial tells whose effect it is.
+        unmoved: states with one value, so that their sensor seems dead.
+        unseen: states that no sensor shows, without the memory of adopted effects.
+        memory: states of that memory.
     """
-    return not any(np.any(data.commands[i, :T]) for i, T in enumerate(data.lengths))
+
+    still: tuple[str, ...]
+    on_off: frozenset[str]
+    sent: Mapping[str, tuple[str, ...]]
+    same: Mapping[str, tuple[str, ...]]
+    unmoved: tuple[str, ...]
+    unseen: frozenset[str]
+    memory: frozenset[str]
 
 
-def switches(data: Data) -> set[str]:
-    """Return the inputs that were only on or off, whose effects on the amplitude can't be known."""
-    found = set()
-    for j, name in enumerate(data.model.input_names):
-        sent = [data.commands[i, :T, j] for i, T in enumerate(data.lengths)]
-        levels = np.unique(np.concatenate(sent))
-        if levels.size == 2 and 0.0 in levels:
-            found.add(name)
-    return found
+def excitation(data: Data) -> Excitation:
+    """Return what moved in the trials."""
+    model = data.model
+    commands = np.concatenate([data.commands[i, :T] for i, T in enumerate(data.lengths)])
+    shown = [n for i, n in enumerate(model.state_names) if i not in data.hidden]
+
+    def moves(name: str, values: Array) -> bool:
+        return float(np.ptp(values)) > ROUNDING * max(data.scales.peak(name), 1e-12)
+
+    inputs = dict(zip(model.input_names, commands.T, strict=True))
+    states = {n: data.states[:, model.state_names.index(n)] for n in shown}
+    states = {n: values[np.isfinite(values)] for n, values in states.items()}
+    still = tuple(n for n, values in inputs.items() if not moves(n, values))
+    levels = {n: np.unique(values) for n, values in inputs.items()}
+
+    # copies of each other, by what was sent and by what it moves
+    like = same = _proportional(commands, ROUNDING)
+    if like.sum() > model.m:
+        x, u = data.y[:-1].reshape(-1, model.n), data.runs(data.commands).reshape(-1, model.m)
+        at = np.linspace(0, len(x) - 1, SAMPLES).astype(int)
+        with np.errstate(all="ignore"):
+            slopes = model.system.linearise(x[at], u[at], model.values, data.dt)[1]
+        same = like & _proportional(slopes.reshape(-1, model.m), MOVES_STATE)
+
+    def groups(like: Any) -> dict[str, tuple[str, ...]]:
+        names = {name: j for j, name in enumerate(model.input_names) if name not in still}
+        return {one: tuple(n for n in names if like[names[one], names[n]]) for one in names}
+
+    return Excitation(
+        still,
+        frozenset(n for n, own in levels.items() if own.size == 2 and 0.0 in own),
+        groups(like),
+        groups(same),
+        tuple(n for n, values in states.items() if values.size and not moves(n, values)),
+        frozenset(n for n in shown if not data.seen[..., model.state_names.index(n)].any()),
+        frozenset(model.state_names) - {*shown},
+    )
 
 
-def still_states(data: Data) -> list[str]:
-    """Return the states with exactly one value in all trials, so that their sensor seems dead."""
-    found = []
-    for i, name in enumerate(data.model.state_names):
-        if i in data.hidden:
-            continue
-        values = data.states[np.isfinite(data.states[:, i]), i]
-        if values.size and float(np.ptp(values)) <= ROUNDING * max(data.scales.peak(name), 1e-12):
-            found.append(name)
-    return found
+def _proportional(columns: Array, off: float) -> Any:
+    """Return which columns (N, m) are multiples of each other, (m, m), `off` relative to them."""
+    peak = columns[np.abs(columns).argmax(axis=0), np.arange(columns.shape[1])]
+    unit = columns / np.where(peak == 0, 1.0, peak)
+    away = (np.abs(unit[:, :, None] + sign * unit[:, None]).max(axis=0) for sign in (-1, 1))
+    return (np.minimum(*away) <= off) | np.eye(columns.shape[1], dtype=bool)
 
 
 def knowable(
@@ -247,96 +272,49 @@ def knowable(
         effects: all candidates.
         whole: names of effects that the model has already, which stay as they are.
     """
-    alike = copies(data)
-    effects = _of_moving(data, effects, whole, alike)
-    same = {name for name, group in alike.same.items() if len(group) > 1}
-    still, unmoved, on_off = set(constant_inputs(data)), set(still_states(data)), switches(data)
-    dead = {n for i, n in enumerate(data.model.state_names) if not data.seen[..., i].any()}
-    memory = {data.model.state_names[i] for i in data.hidden}
+    moved, sensors = excitation(data), SensorFamily | SensorDelayFamily | SensorLagFamily
+    still, unmoved, unseen = {*moved.still}, {*moved.unmoved}, {*moved.unseen}
+    copied = {name for name, group in moved.same.items() if len(group) > 1}
     kept = []
-    for effect in effects:
-        family, joined = effect.family, effect.site.targets
-        if not family.shows(effect.site):
-            continue
-        if isinstance(family, LossFamily):
-            joined = joined[:1]  # a wheel turns, even if the robot does not
-        targets = {part for t in joined for part in t.split("<-")}
-        if targets & memory:
-            continue
-        lost = still - targets if effect.name in whole and not targets <= still else still
-        if isinstance(family, InputFamily | MemoryFamily | RateFamily) and targets & lost:
-            continue
-        if isinstance(family, RateFamily) and targets & same:
-            continue  # one of several copies: none of them can be blamed
-        if targets & on_off and (isinstance(family, InputFamily) or family is backlash):
-            continue
-        if isinstance(family, RateFamily | LossFamily | MediumFamily) and targets & unmoved:
-            continue
-        sensors = SensorFamily | SensorDelayFamily | SensorLagFamily
-        if isinstance(family, sensors) and targets & (dead | unmoved):
-            continue
+    for effect in _of_moving(data, effects, whole, moved):
+        family, targets = effect.family, effect.site.targets
+        acts = {part for t in targets for part in t.split("<-")}
+        if isinstance(family, LossFamily):  # a wheel turns, even if the robot does not
+            acts = {*targets[0].split("<-")}
+        lost = {*moved.memory}
+        if isinstance(family, InputFamily | MemoryFamily | RateFamily):
+            # what the model has already needs one of its inputs to move
+            lost |= still - acts if effect.name in whole and not acts <= still else still
+        if isinstance(family, InputFamily) or family is backlash:
+            lost |= moved.on_off
+        if isinstance(family, RateFamily):
+            lost |= copied  # one of several copies: none of them can be blamed
+        if isinstance(family, RateFamily | LossFamily | MediumFamily | sensors):
+            lost |= unmoved
+        if isinstance(family, sensors):
+            lost |= unseen
         late = isinstance(family, SensorDelayFamily) and len(targets) > 1
-        if late and not told_by(data.model, effect.site.targets) - dead - unmoved - memory:
-            continue
-        kept.append(effect)
+        told = not late or told_by(data.model, targets) - unseen - unmoved - moved.memory
+        if told and family.shows(effect.site) and not acts & lost:
+            kept.append(effect)
     return tuple(kept)
 
 
-@dataclass(frozen=True)
-class Copies:
-    """Which inputs have the same commands up to a factor, {input: all of them, itself included}.
-
-    `sent`: in all trials. `same`: those of them that also move all states alike, so that no trial
-    tells whose effect it is.
-    """
-
-    sent: Mapping[str, tuple[str, ...]]
-    same: Mapping[str, tuple[str, ...]]
-
-
-def copies(data: Data) -> Copies:
-    """Return the inputs that are copies of each other, constant ones excluded."""
-    model, still = data.model, set(constant_inputs(data))
-    sent = np.concatenate([data.commands[i, :T] for i, T in enumerate(data.lengths)])
-    like = same = _proportional(sent, ROUNDING)
-    if like.sum() > model.m:
-        x, u = data.y[:-1].reshape(-1, model.n), data.runs(data.commands).reshape(-1, model.m)
-        at = np.linspace(0, len(x) - 1, SAMPLES).astype(int)
-        with np.errstate(all="ignore"):
-            slopes = model.system.linearise(x[at], u[at], model.values, data.dt)[1]
-        same = like & _proportional(slopes.reshape(-1, model.m), MOVES_STATE)
-
-    def groups(like: Any) -> dict[str, tuple[str, ...]]:
-        names = {name: j for j, name in enumerate(model.input_names) if name not in still}
-        return {one: tuple(n for n in names if like[names[one], names[n]]) for one in names}
-
-    return Copies(groups(like), groups(same))
-
-
-def _proportional(columns: Array, off: float) -> Any:
-    """Return which columns (N, m) are multiples of each other, (m, m), `off` relative to them."""
-    peak = columns[np.abs(columns).argmax(axis=0), np.arange(columns.shape[1])]
-    unit = columns / np.where(peak == 0, 1.0, peak)
-    away = (np.abs(unit[:, :, None] + sign * unit[:, None]).max(axis=0) for sign in (-1, 1))
-    return (np.minimum(*away) <= off) | np.eye(columns.shape[1], dtype=bool)
-
-
 def _of_moving(
-    data: Data, effects: Sequence[Effect], whole: Collection[str], alike: Copies
+    data: Data, effects: Sequence[Effect], whole: Collection[str], moved: Excitation
 ) -> list[Effect]:
     """Replace effects of inputs by those of the inputs that move and of all of their copies."""
-    still, on_off = set(constant_inputs(data)), switches(data)
     named, found = set[str](), list[Effect]()
     for effect in effects:
         site, family = effect.site, effect.family
-        lost = still | on_off if isinstance(family, InputFamily) else still
-        shown = tuple(name for name in site.targets if name not in lost)
         if not isinstance(family, InputFamily | MemoryFamily) or effect.name in whole:
             found.append(effect)
             continue
+        lost = {*moved.still, *(moved.on_off if isinstance(family, InputFamily) else ())}
+        shown = tuple(name for name in site.targets if name not in lost)
         targets = shown if len(shown) > 1 else site.targets
         # of those that no trial tells apart, and of all that are sent the same
-        for groups in (alike.same, alike.sent):
+        for groups in (moved.same, moved.sent):
             joined = {name for one in targets for name in groups.get(one, (one,))}
             several = tuple(name for name in data.model.input_names if name in joined)
             name = replace(effect, site=replace(site, targets=several)).name

@@ -9,9 +9,8 @@ from grounded import GroundedError, Model, Param, Trial
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.validation.limits import (
+    excitation,
     knowable,
-    still_states,
-    switches,
 )
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
@@ -49,7 +48,7 @@ def stuck(trials, *states):
 
 def test_what_acts_on_a_state_that_never_moved_is_not_offered():
     data = prepare(pendulum, list(stuck(swings(), 1)))
-    assert still_states(data) == ["omega"]
+    assert excitation(data).unmoved == ("omega",)
     offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
     assert "rate_gain:theta" in offered and "sensor_scale:theta" in offered
     assert not {"viscous_friction:omega", "sensor_delay:omega", "sensor_bias:omega"} & offered
@@ -85,9 +84,9 @@ def test_how_much_a_switch_is_on_is_not_doubted():
     trials = [replace(t, inputs=(np.asarray(t.inputs) > 0) * 1.0) for t in swings()]
     data = prepare(pendulum, trials)
     offered = {e.name for e in knowable(data, Library().candidates(pendulum, data.scales))}
-    assert switches(data) == {"torque"} and "delay:torque" in offered
+    assert excitation(data).on_off == {"torque"} and "delay:torque" in offered
     assert not {f"{name}:torque" for name in ("saturation", "input_gain", "backlash")} & offered
-    assert not switches(prepare(pendulum, swings()))
+    assert not excitation(prepare(pendulum, swings())).on_off
 
 
 def test_a_model_that_is_no_number_at_a_measured_state_says_where():
