@@ -5,11 +5,12 @@
 
 of the states that are measured. The extended Kalman filter linearises at each state that it
 reaches; the linear equations are those of `grounded.filter.kalman`, which begin with an identity
-step before the trial. For the noise, the linearisation is fixed while L-BFGS optimises the
-logarithms of its variances (the gradient comes from one pass of the smoother), and renewed between
-rounds, since a track that was filtered with the wrong noise is a poor linearisation point. A
-variance without effect on the data (of a state that is never disturbed) would decrease for ever; it
-stops at a floor far below the visible scatter.
+step before the trial. With r and N of the disturbance smoother (mean and information of what
+the data tell of w), the slope of the log-likelihood by a process variance is sum(r^2 - N) / 2. So
+at its maximum sum(r^2) = sum(N), and each variance is multiplied by their ratio (the fixed point of
+MacKay, "Bayesian interpolation", Neural Computation 4, 1992) while the likelihood rises. A variance
+without effect on the data (of a state that is never disturbed) would decrease for ever; it stops at
+a floor far below the visible scatter.
 
 Arrays have time first, (T + 1, B, ...): see `grounded.estimate.record`.
 Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
@@ -27,20 +28,18 @@ from grounded.estimate.record import Record, RecordBatch, batch_of
 from grounded.filter.kalman import (
     Gains,
     LinearSystem,
-    gains,
-    innovations,
     predicted,
     smoother,
     updated,
-    whole,
 )
 from grounded.frozen import Array, readonly
 from grounded.model import Model
 
 FLOOR = 1e-4  # smallest std, as a fraction of the visible scatter
-ROUNDS = 8  # most linearisations
-LAST_GAIN = 0.2  # [nats] a round that gains less is the last
-TRUSTED = np.log(100.0)  # largest change of a log variance between two linearisations
+ROUNDS = 30  # most steps towards the likeliest noise
+LAST_GAIN = 0.05  # [nats] a step that gains less is the last
+TRUSTED = np.log(100.0)  # largest change of a log variance in a step
+SHORTEST = 0.05  # smallest fraction of a step that is tried
 ROWS = 8_000  # samples; more add little information about the noise
 
 
@@ -147,17 +146,23 @@ def process_noise(
     batch = batch_of(_enough(records), latency)
     visible = first_noise(batch, sizes).process
     noise = NoiseStd(visible, measurement, batch.dt)
-    best = filtered(model, batch, noise)
+    best, part = filtered(model, batch, noise), 1.0
     for _ in range(ROUNDS):
         if not np.isfinite(best.loglik):
             break
-        trial, promised = _climb(batch, noise, best, visible)
-        if not promised - best.loglik > LAST_GAIN:
-            break
+        back = smoother(best.gains, best.eps)
+        r, N = (np.maximum(a[1:][batch.valid].sum(axis=0), 1e-300) for a in (back.r**2, back.N))
+        step = part * np.clip(np.log(r / N), -TRUSTED, TRUSTED)
+        process = np.clip(noise.process * np.exp(0.5 * step), FLOOR * visible, 100 * visible)
+        trial = NoiseStd(process, measurement, batch.dt)
         after = filtered(model, batch, trial)
-        if not after.loglik > best.loglik:
+        gain = after.loglik - best.loglik
+        if gain > 0:
+            noise, best, part = trial, after, min(2 * part, 1.0)
+        elif (part := part / 4) < SHORTEST:
             break
-        noise, best = trial, after
+        if 0 < gain < LAST_GAIN:
+            break
     return noise
 
 
@@ -241,31 +246,6 @@ def _likelihood(g: Gains, eps: Array, batch: RecordBatch) -> float:
     return -0.5 * total if np.isfinite(total) else -np.inf
 
 
-def relinked(about: Filtered, batch: RecordBatch, noise: NoiseStd) -> tuple[Gains, Array, float]:
-    """Filter with another noise and the same linearisation.
-
-    Returns:
-        The gains, the whitened innovations (T + 1, B, n) and the log-likelihood.
-
-    Raises:
-        numpy.linalg.LinAlgError: if a covariance is not finite.
-    """
-    A, n = about.gains.system.A, batch.start.shape[1]
-    d, r = (np.zeros((*shape, whole(1, n))) for shape in (A.shape[:3], (len(A) + 1, *A.shape[1:3])))
-    d[1:, ..., 0] = (A[1:] @ (about.x_prior - about.x)[:-1, ..., None])[..., 0]
-    r[1:, ..., 0] = about.e
-    g = gains(_system(batch, noise, A))
-    eps = innovations(g, d, r)[0][..., 0]
-    return g, eps, _likelihood(g, eps, batch)
-
-
-def variance_slopes(g: Gains, eps: Array, batch: RecordBatch, noise: NoiseStd) -> Array:
-    """Return the gradient of the log-likelihood by the log variances of the process, (n,)."""
-    back = smoother(g, eps)
-    state = 0.5 * (back.r**2 - back.N)
-    return np.asarray(state[1:][batch.valid].sum(axis=0) * noise.process**2 * batch.dt / noise.dt)
-
-
 def first_noise(batch: RecordBatch, sizes: Array | float = 1.0) -> NoiseStd:
     """Return a rough estimate of the noise from the smoothness of the measurements, as a start.
 
@@ -293,37 +273,6 @@ def _enough(records: Sequence[Record]) -> list[Record]:
     order = np.random.default_rng(0).permutation(len(records))
     before = np.cumsum([0, *(records[i].steps for i in order)])[:-1]
     return [records[i] for i, rows in zip(order, before, strict=True) if rows < ROWS]
-
-
-def _climb(
-    batch: RecordBatch, noise: NoiseStd, about: Filtered, visible: Array
-) -> tuple[NoiseStd, float]:
-    """Return the likeliest process noise for a fixed linearisation, and its log-likelihood there.
-
-    `visible` (n,) is a rough one.
-    """
-    from scipy.optimize import minimize
-
-    def there(theta: Array) -> NoiseStd:
-        return NoiseStd(np.exp(0.5 * theta), noise.measurement, noise.dt)
-
-    def cost(theta: Array) -> tuple[float, Array]:
-        try:
-            g, eps, loglik = relinked(about, batch, there(theta))
-        except np.linalg.LinAlgError:
-            loglik = -np.inf
-        if not np.isfinite(loglik):
-            return 1e12, np.zeros_like(theta)
-        slope = variance_slopes(g, eps, batch, there(theta))
-        return -loglik / batch.count, -slope / batch.count
-
-    theta = 2 * np.log(noise.process)
-    low = np.maximum(2 * np.log(FLOOR * visible), theta - TRUSTED)
-    high = np.minimum(2 * np.log(1e4 * visible), theta + TRUSTED)
-    bounds = list(zip(low, high, strict=True))
-    options = {"maxiter": 60, "ftol": 1e-9, "gtol": 1e-6}
-    found = minimize(cost, theta, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
-    return there(found.x), -float(found.fun) * batch.count
 
 
 def _spread(values: Array) -> float:

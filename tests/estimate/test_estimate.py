@@ -1,4 +1,4 @@
-"""Compares the filter with a dense Gaussian, slopes with differences, intervals with truth."""
+"""Compares the filter with a dense Gaussian, noise and states with truth."""
 
 from dataclasses import replace
 from functools import partial
@@ -10,7 +10,7 @@ from facts import holding
 from grounded.compile.problem import queue_of
 from grounded.errors import GroundedError
 from grounded.estimate import NoiseStd, batch_of, process_noise, record_of, smoothed
-from grounded.estimate.smoother import filtered, relinked, variance_slopes
+from grounded.estimate.smoother import LAST_GAIN, filtered
 from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
@@ -123,26 +123,19 @@ def cut_short(model, trial, steps):
     return Trial(trial.states[: steps + 1], trial.inputs[:steps], DT, *names)
 
 
-def test_slopes_by_the_variances_match_differences():
-    _, trials = simulated(SPRING, np.random.default_rng(2), SPRING_NOISE, B=3, T=25)
+def test_no_other_noise_is_likelier():
+    _, trials = simulated(SPRING, np.random.default_rng(2), SPRING_NOISE, B=3, T=60)
     lost = trials[1].states.copy()
     lost[5:8, 0], lost[3] = np.nan, np.nan
     gappy = Trial(lost, trials[1].inputs, DT, SPRING.state_names, SPRING.input_names)
-    some = (trials[0], gappy, cut_short(SPRING, trials[2], 10))
-    batch = batch_of([record_of(SPRING, one) for one in some])
-    base = filtered(SPRING, batch, SPRING_NOISE)
-
-    def at(theta):
-        noise = NoiseStd(np.exp(theta / 2), SPRING_NOISE.measurement, DT)
-        return noise, *relinked(base, batch, noise)
-
-    theta = 2 * np.log(SPRING_NOISE.process)
-    noise, gains, eps, loglik = at(theta)
-    assert loglik == pytest.approx(base.loglik)
-    slope = variance_slopes(gains, eps, batch, noise)
-    for i, step in enumerate(1e-4 * np.eye(2)):
-        difference = (at(theta + step)[-1] - at(theta - step)[-1]) / 2e-4
-        assert slope[i] == pytest.approx(difference, rel=1e-5)
+    records = [
+        record_of(SPRING, one) for one in (trials[0], gappy, cut_short(SPRING, trials[2], 10))
+    ]
+    found = process_noise(SPRING, records, SPRING_NOISE.measurement)
+    best = filtered(SPRING, batch_of(records), found).loglik
+    for other in found.process * np.exp([[0.2, 0], [-0.2, 0], [0, 0.2], [0, -0.2], [0.1, -0.1]]):
+        noise = replace(found, process=other)
+        assert filtered(SPRING, batch_of(records), noise).loglik < best + LAST_GAIN
 
 
 def test_padding_and_lost_samples_change_nothing_of_the_others():
