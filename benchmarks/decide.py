@@ -52,7 +52,7 @@ def fitted(case):
             if (rest := options.less(one, cause)) is not None:
                 less[one.causes, cause] = rest
     label = of_crude(case.label, case.model)
-    true = oracle(case.model, case.trials, case.latency, label, document["ranking"])
+    true = oracle(case.model, case.trials, case.latency, label)
     ruler = kept["ruler"]
     return {
         "options": list(known.values()), "less": less, "compare": ruler.comparison, "label": label,

@@ -1,9 +1,7 @@
 """Scoring of diagnoses against opened labels, and against an oracle that knows the effects.
 
 The oracle fits only the true effects (values free, noise and parameters as in a diagnosis). A case
-counts as detectable if the evidence of the true effects exceeds 3 nats, and as distinguishable if
-it is also 3 nats above that of the likeliest other effects in the diagnosis' ranking, fitted in the
-same way.
+counts as detectable if the evidence of the true effects exceeds 3 nats.
 
 If a case has wrong parameters beside its effect, naming these is correct, too: the effect must be
 first among the other names, whether the parameters are calibrated together or named one by one.
@@ -15,7 +13,7 @@ interval.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,7 +35,6 @@ Marks = Sequence[Mapping[str, Any]]
 DETECTABLE = 3.0  # nats
 WORSE = 1.01  # ratio of errors from which the named effects predict worse than none
 LEAVES = 1.3  # gap from which a false claim misleads
-RIVALS = 2
 LATE = {"delay": "sensor_delay", "lag": "sensor_lag"}  # findings of the instruments as effects
 
 
@@ -47,15 +44,10 @@ class Oracle:
 
     evidence: float
     each: Mapping[str, float]  # what the evidence loses without each true effect
-    rival: float = -np.inf  # evidence of the likeliest other [nats]
 
 
 def oracle(
-    model: Model,
-    trials: Sequence[Trial],
-    latency: Array,
-    label: Mapping[str, Any],
-    ranking: Sequence[Mapping[str, Any]] = (),
+    model: Model, trials: Sequence[Trial], latency: Array, label: Mapping[str, Any]
 ) -> Oracle | None:
     """Fit the true effects of a case.
 
@@ -64,8 +56,6 @@ def oracle(
         trials: the trials of the case.
         latency: modelled delay of its inputs (m,) [s].
         label: the opened label.
-        ranking: the ranking of a diagnosis. If one effect is true, its likeliest others are fitted
-            too.
 
     Returns:
         The oracle; None if the label has no effect of the library.
@@ -73,50 +63,31 @@ def oracle(
     if not label["effects"]:
         return None
     data = prepare(model, trials, latency)
-    effects = [Library().effect(e["effect"], model, data.scales) for e in label["effects"]]
-    values = [
-        {q.name: float(e["params"][q.name]) for q in effect.free}
-        for e, effect in zip(label["effects"], effects, strict=True)
-    ]
-    known = [effect.name for effect in effects]
-    others = sorted(
-        (r for r in ranking if r["effect"] not in known and r["evidence"] is not None),
-        key=lambda r: -r["evidence"],
-    )
-    others = [] if len(known) > 1 else others[:RIVALS]
-    for row in others:
-        effects.append(Library().effect(row["effect"], model, data.scales))
-        values.append({q.name: float(row["params"][q.name]["value"]) for q in effects[-1].free})
+    effects = {
+        one["effect"]: (Library().effect(one["effect"], model, data.scales), one["params"])
+        for one in label["effects"]
+    }
     search = HypothesisSearch(data, Library().candidates(model, data.scales))
     search.nulls()
 
-    def fitted(which: Sequence[int]) -> float:
+    def fitted(names: Collection[str]) -> float:
         """Return the best score of a set of effects."""
         h = Hypothesis()
-        for i in which:
-            h = h.plus(effects[i], values[i])
+        for effect, values in map(effects.__getitem__, names):
+            h = h.plus(effect, {q.name: float(values[q.name]) for q in effect.free})
         starts = [(h, f.noise, f.track) for f in (*search.of_size(0), *_plain(search))]
         for start in [*starts, search.fresh(h)]:
-            fits = search.refined([start], 12)
-            for fit in fits:
+            for fit in search.refined([start], 12):
                 search.calibrated(fit)
-        names = tuple(sorted(h.names))
-        found = [
-            f for f in search.of_size(len(which)) if tuple(sorted(f.hypothesis.names)) == names
-        ]
+        found = [f for f in search.of_size(len(h.names)) if {*f.hypothesis.names} == {*h.names}]
         search.fair(found[0])
         return search.score(found[0])
 
-    everything = list(range(len(known)))
-    whole = fitted(everything)
-    each = {}
-    for i, effect in enumerate(effects[: len(known)]):
-        rest = [j for j in everything if j != i]
-        below = fitted(rest) if rest else search.score(search.best_null())
-        each[effect.name] = whole - below
-    none = search.score(search.best_null())
-    rivals = [fitted([len(known) + i]) - none for i in range(len(others))]
-    return Oracle(whole - none, each, max(rivals, default=-np.inf))
+    whole, each = fitted(effects), dict[str, float]()
+    for name in effects:
+        rest = effects.keys() - {name}
+        each[name] = whole - (fitted(rest) if rest else search.score(search.best_null()))
+    return Oracle(whole - search.score(search.best_null()), each)
 
 
 def _plain(search: HypothesisSearch) -> list[Any]:
@@ -167,7 +138,6 @@ def judge(
     if known is not None:
         marks["evidence"] = known.evidence
         marks["detectable"] = known.evidence > DETECTABLE
-        marks["distinguishable"] = known.evidence > max(known.rival, 0.0) + DETECTABLE
         marks["each_detectable"] = all(v > DETECTABLE for v in known.each.values())
     return marks
 
@@ -261,10 +231,8 @@ def summary(marks: Marks) -> dict[str, Any]:
 
 def _single(some: Marks) -> dict[str, Any]:
     seen = [m for m in some if m.get("detectable")]
-    apart = [m for m in seen if m["distinguishable"]]
     return {
         "first": _part(seen, "first"),
-        "first_of_distinguishable": _part(apart, "first"),
         "in_group": _part(seen, "in_group"),
         **_of_effects(some),
     }

@@ -7,7 +7,7 @@ on one worker or on fifty. `grounded.engine` decides where jobs run.
     finished    a mapping from a job's key to its result; jobs found in it are not run again. The
                 caller may keep it on disk, so that an interrupted study can be continued. The key
                 contains a hash of the sources, so that results of two versions are never mixed.
-    lost worker the jobs that it leaves undone are run again, not the study.
+    lost worker it ends the study, and running it again goes on from what is finished.
 
 The module also has the statistics that studies report: means with standard errors, improvements,
 slopes, tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so
@@ -34,7 +34,6 @@ from grounded.checks import refused
 from grounded.engine import Engine, processes
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
-ROUNDS = 5  # most rounds in which jobs of lost workers are run again
 R = TypeVar("R")
 
 
@@ -86,7 +85,7 @@ def run_jobs(
         progress: called with the number of jobs done and the total.
 
     Raises:
-        GroundedError: if workers keep dying.
+        GroundedError: if a worker dies.
     """
     engine, finished = engine or Engine(), {} if finished is None else finished
     results = {job.key: finished[job.key] for job in jobs if job.key in finished}
@@ -100,17 +99,13 @@ def run_jobs(
 
     if progress:
         progress(len(results), total)
-    lost: BaseException | None = None
-    for _ in range(ROUNDS):
-        try:
-            for key, result in processes(engine, _call, waiting):
-                keep(key, result)
-        except BrokenProcessPool as error:
-            lost = error
-        waiting = [job for job in waiting if job.key not in results]
-        if not waiting:
-            return [results[job.key] for job in jobs]
-    raise refused("run.workers", lost=len(waiting), total=total, why=str(lost))
+    try:
+        for key, result in processes(engine, _call, waiting):
+            keep(key, result)
+    except BrokenProcessPool as error:
+        undone = total - len(results)
+        raise refused("run.workers", lost=undone, total=total, why=str(error)) from None
+    return [results[job.key] for job in jobs]
 
 
 def every(**axes: Iterable[Any]) -> list[dict[str, Any]]:

@@ -171,14 +171,12 @@ def test_a_shift_of_a_parameter_is_counted_from_the_crude_value():
     assert of_crude(label | {"param_error": 0.0}, true)["effects"] == effects
 
 
-def test_what_a_rival_explains_as_well_is_not_distinguishable():
-    close, ahead = (Oracle(20.0, {"delay:a": 20.0}, rival) for rival in (18, 9))
-    marks = [marks_of("delay:a", ["stall:a"], known=close)]
-    marks.append(marks_of("delay:a", ["delay:a"], errors=(1.0, 0.6), known=ahead))
-    assert [m["distinguishable"] for m in marks] == [False, True]
+def test_what_is_not_detectable_is_not_counted():
+    named = {20.0: "stall:a", 9.0: "delay:a", 2.0: "delay:a"}
+    known = {nats: Oracle(nats, {"delay:a": nats}) for nats in named}
+    marks = [marks_of("delay:a", [name], known=known[nats]) for nats, name in named.items()]
     row = summary(marks)["single"]
     assert row["first"]["of"] == 2 and row["first"]["share"] == 0.5
-    assert row["first_of_distinguishable"] == share([True])
 
 
 def test_shares_have_the_interval_of_wilson():

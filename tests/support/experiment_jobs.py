@@ -22,9 +22,5 @@ def dies_once(seed, marker):
     return {"seed": seed}
 
 
-def dies_always(seed):
-    os._exit(1)
-
-
 def fails(seed):
     raise ValueError("this is a mistake, not a lost worker")

@@ -152,7 +152,7 @@ def score_case(
     task = workspace.task
     label = of_crude(open_label(Path(labels), name, entry), task.model)
     latency = np.zeros(task.model.m) if task.latency is None else task.latency
-    known = oracle(task.model, workspace.task_trials(), latency, label, diagnosis["ranking"])
+    known = oracle(task.model, workspace.task_trials(), latency, label)
     return judge(label, diagnosis, known)
 
 
@@ -174,7 +174,7 @@ def diagnose_cases(
         progress: called with the number of jobs done and the total.
 
     Raises:
-        GroundedError: if the folder holds no challenge, or workers keep dying.
+        GroundedError: if the folder holds no challenge, or a worker dies.
     """
     names = undiagnosed(folder, again=again)
     jobs = [
