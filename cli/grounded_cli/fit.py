@@ -9,7 +9,6 @@ from grounded.diagnosis.telling import instrument_lines
 from grounded.engine import Engine, cores
 from grounded.fit import Fit
 from grounded.fit.result import FittedValue
-from grounded.model import Model
 from grounded.result import listed
 from grounded_cli.console.options import names_of
 from grounded_cli.console.terminal import (
@@ -53,8 +52,8 @@ def fit(
     for k, line in enumerate(corrected):
         show(field("sensors" if k == 0 else "", line))
     show("\n" * bool(corrected) + _parameters(found))
-    if found.before is not None and found.after is not None:
-        show(f"\n{_errors(found, workspace.base_model)}")
+    if found.prediction_error:
+        show(f"\n{_errors(found)}")
         show("\n".join(lines(HELD_OUT, "  ", "  ")))
     tell(done.findings)
     show(field("written", "[model] params" if apply else "nothing"))
@@ -82,18 +81,11 @@ def _digits(e: FittedValue) -> int:
     return min(max(math.floor(math.log10(size)) - math.floor(math.log10(width)) + 2, DIGITS), MOST)
 
 
-def _errors(found: Fit, model: Model) -> str:
-    assert found.before is not None and found.after is not None
-    before, after = found.before, found.after
+def _errors(found: Fit) -> str:
     rows = [
-        (
-            name,
-            *(number(float(e[i]), 3) for e in (before.one_step, after.one_step)),
-            *(number(float(e[i]), 3) for e in (before.ahead, after.ahead)),
-            shown(model.states.get(name, "")),
-        )
-        for i, name in enumerate(before.names)
+        (f"{name}, {row.horizon_s:.3g} s ahead", *(number(e, 3) for e in ends), shown(unit))
+        for name, unit in found.prediction_error[0].unit_by_channel.items()
+        for row in found.prediction_error
+        for ends in [(row.crude[name], row.with_effects[name])]
     ]
-    ahead = f"{found.before.horizon_s:.3g} s"
-    header = ("held-out error", "1 step before", "after", f"{ahead} before", "after", "unit")
-    return table(rows, header)
+    return table(rows, ("held-out error", "before", "after", "unit"))

@@ -8,6 +8,6 @@ notion of what trials identify are those of `grounded.diagnosis`. Read `paramete
 from __future__ import annotations
 
 from grounded.fit.parameters import fit
-from grounded.fit.result import Fit, FittedValue, PredictionError
+from grounded.fit.result import Fit, FittedValue
 
-__all__ = ["Fit", "FittedValue", "PredictionError", "fit"]
+__all__ = ["Fit", "FittedValue", "fit"]

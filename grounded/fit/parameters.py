@@ -10,11 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 
-from grounded.checks import known, list_of, of_type, one_of, refused, wrong
+from grounded.checks import known, list_of, of_type, refused, wrong
 from grounded.diagnosis.hypotheses.search import (
     CRUDE,
     TO_THE_TOP,
@@ -45,7 +44,6 @@ from grounded.progress import Stages, interruptible
 from grounded.task import Task
 from grounded.trial import Trial
 
-Latency = Literal["known", "common", "each"] | Mapping[str, tuple[int, ...]]
 GRID = 21  # values of a threshold that are tried
 
 
@@ -55,8 +53,7 @@ def fit(
     trials: Sequence[Trial],
     names: Sequence[str] | None = None,
     *,
-    latency: Array | None = None,
-    fit_latency: Latency = "known",
+    delays: Mapping[str, tuple[int, ...]] | None = None,
     hidden: Sequence[str] = (),
     one_message: Sequence[str] = (),
     interpolated_s: float = 0.0,
@@ -70,10 +67,8 @@ def fit(
             also gives the latency.
         trials: real trials of one time step; a state that no sensor shows is NaN.
         names: parameters to fit; None for all uncertain ones.
-        latency: (m,) transport delay of each input [s], fixed or the start value; None for zero,
-            or the task's.
-        fit_latency: "known" (fixed), "common" (fit one value for all inputs), "each", or
-            {name: inputs}: each of these, for the inputs with these indices.
+        delays: {name: inputs}: transport delays to fit, each for the inputs with these indices. The
+            task's latency is the start; that of the other inputs is fixed.
         hidden: states without a sensor whose start is known, such as memories of adopted effects.
         one_message: states that are logged in one message, so that all or none of them are late.
         interpolated_s: standard deviation of times [s] because the states were interpolated.
@@ -94,7 +89,7 @@ def fit(
     if isinstance(names, str) or not isinstance(names, Sequence | None):
         raise wrong("names", names, must="names")
     given = model.model if isinstance(model, Task) else model
-    delayed = _delayed(given, fit_latency)
+    delayed = dict(delays or {})
     asked = _asked(given, names, bool(delayed))
     if max((trial.known_steps for trial in logged), default=0) < 3:
         raise refused("given.short", what="fit", needs=3)
@@ -110,7 +105,7 @@ def fit(
         interpolated_s=interpolated_s,
     )
     data = sound.data
-    late = data.latency.copy() if latency is None else np.array(latency, float)
+    late = data.latency.copy()
     for inputs in delayed.values():
         late[list(inputs)] = late[inputs[0]]
     kept = asked if names is not None else {n for n in asked if data.model.params[n].uncertain}
@@ -271,19 +266,6 @@ def _delay(data: Data, inputs: Sequence[int]) -> Effect:
     name = "delay:" + "+".join(data.model.input_names[j] for j in inputs)
     known = float(data.latency[inputs[0]])
     return delay_again(Library().effect(name, data.model, data.scales), known, known)
-
-
-def _delayed(model: Model, fit_latency: Latency) -> dict[str, tuple[int, ...]]:
-    """Return the inputs of each delay that is fitted, by its name."""
-    choices: dict[str, dict[str, tuple[int, ...]]] = {
-        "known": {},
-        "common": {"latency": tuple(range(model.m))},
-        "each": {f"latency:{name}": (j,) for j, name in enumerate(model.input_names)},
-    }
-    if not isinstance(fit_latency, str):
-        return dict(fit_latency)
-    one_of("fit_latency", fit_latency, choices)
-    return choices[fit_latency]
 
 
 def _asked(model: Model, names: Sequence[str] | None, more: bool) -> tuple[str, ...]:

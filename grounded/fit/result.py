@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import Finding as Fault
-from grounded.diagnosis.error_report import Identifiable
+from grounded.diagnosis.error_report import Identifiable, RulerRow
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -25,17 +25,6 @@ from grounded.findings import found as finding
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.result import Result, document
-
-
-@dataclass(frozen=True, eq=False)
-class PredictionError:
-    """Root mean square errors per channel; NaN for a channel never seen at a window's end."""
-
-    names: tuple[str, ...]
-    one_step: Array  # (ny,) in the channels' units
-    ahead: Array  # (ny,) after `horizon_s`
-    horizon_s: float  # [s]
-    windows: int  # number of windows of `horizon_s`
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,8 +49,7 @@ class FittedValue:
 class Fit(Result):
     """The result of a fit.
 
-    `params` holds the model's parameters and, if fitted, `latency`, `latency:<input>` or the
-    latencies named in `fit_latency` [s].
+    `params` holds the model's parameters and the fitted `delays` [s].
     """
 
     params: Mapping[str, FittedValue]
@@ -71,8 +59,8 @@ class Fit(Result):
     status: str  # converged or still rising
     samples: int
     nats: float = 0.0  # log evidence over the values as given
-    before: PredictionError | None = None  # of held-out trials; None if none could be held out
-    after: PredictionError | None = None
+    # one step and at most a second ahead, as given (`crude`) and fitted; () if none was held out
+    prediction_error: tuple[RulerRow, ...] = ()
     gain: Gain | None = None  # of the held-out errors, and the same the other way round
     loss: Gain | None = None
     preflight: tuple[Fault, ...] = ()  # findings about the sensors
@@ -115,7 +103,7 @@ class Fit(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `grounded fit --json`; the command sets "applied"."""
-        found = document(
+        return document(
             params={name: vars(e) for name, e in self.params.items()},
             status=self.status,
             sentence=self.sentence,
@@ -123,15 +111,8 @@ class Fit(Result):
             samples=self.samples,
             at_bounds=list(self.at_bounds),
             applied=False,
+            prediction_error=[row.to_json() for row in self.prediction_error],
         )
-        for name, error in (("before", self.before), ("after", self.after)):
-            if error is not None:
-                found[f"prediction_error_{name}"] = document(
-                    horizon_s=error.horizon_s,
-                    one_step=dict(zip(error.names, error.one_step, strict=True)),
-                    ahead=dict(zip(error.names, error.ahead, strict=True)),
-                )
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,13 +145,19 @@ class Found:
         return {one.parameter: one for one in identified(self.free, self.best, known).parameters}
 
 
-def errors_of(ruler: Ruler, fit: Fitted) -> PredictionError:
-    """Return the held-out errors of a fit one step and, at most, a second ahead."""
-    found, last = ruler.errors(fit), len(ruler.steps) - 1
-    rms = found.rms[:, ruler.shown]
-    windows = int(found.count[last].max(axis=-1).sum())
-    names, horizon = tuple(ruler.names), ruler.steps[-1] * ruler.data.dt
-    return PredictionError(names, rms[0], rms[last], horizon, windows)
+def errors_of(ruler: Ruler, before: Fitted, after: Fitted) -> tuple[RulerRow, ...]:
+    """Return the held-out errors of two fits one step and, at most, a second ahead."""
+    units = {name: ruler.data.model.states[name] for name in ruler.names}
+
+    def row(k: int) -> RulerRow:
+        crude, fitted = (
+            dict(zip(units, ruler.errors(fit).rms[k, ruler.shown].tolist(), strict=True))
+            for fit in (before, after)
+        )
+        horizon = ruler.steps[k] * ruler.data.dt
+        return RulerRow(horizon, False, units, ruler.by, crude=crude, with_effects=fitted)
+
+    return tuple(map(row, sorted({0, len(ruler.steps) - 1})))
 
 
 def report(
@@ -214,7 +201,7 @@ def report(
     ruler = Ruler(search.predictor)
     if found.crude is not None and ruler.held_out:
         ruler.beside(found.crude)
-        more |= {"before": errors_of(ruler, found.crude), "after": errors_of(ruler, best)}
+        more |= {"prediction_error": errors_of(ruler, found.crude, best)}
         more |= {"gain": ruler.gain(found.crude, best), "loss": ruler.gain(best, found.crude)}
     status = "converged" if best.settled else "still rising"
     made = Fit(

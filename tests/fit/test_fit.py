@@ -74,8 +74,8 @@ LOUD = ((1e-4, 1e-3), (0.03, 0.2))
     [
         (SPRING, {"k": 9.0, "d": 2.0}, {"noise": NOISE, "B": 6}, {}),
         (SPRING, {}, {"noise": LOUD, "B": 8}, {}),  # one-step least squares finds a drag of 1.0
-        (SPRING, {"k": 5.0}, {"noise": NOISE, "latency": 0.1}, {"fit_latency": "each"}),
-        (SPRING, {"k": 5.0}, {"noise": NOISE, "latency": 0.13}, {"fit_latency": "common"}),
+        (SPRING, {"k": 5.0}, {"noise": NOISE, "latency": 0.1}, {"delays": {"latency:force": (0,)}}),
+        (SPRING, {"k": 5.0}, {"noise": NOISE, "latency": 0.13}, {"delays": {"latency": (0,)}}),
         (STALLING, {"stall": 0.1, "gain": 1.5}, {"noise": CALM, "B": 8, "low": 0.0}, {}),
     ],
 )
@@ -91,7 +91,8 @@ def test_parameters_delays_and_thresholds_are_recovered(model, start, made, opti
     if options:
         assert found.latency[0] == [*found.params.values()][-1].value
     if start:
-        assert (found.after.ahead < 0.7 * found.before.ahead).all()
+        row = found.prediction_error[-1]
+        assert all(row.with_effects[name] < 0.7 * was for name, was in row.crude.items())
 
 
 def test_intervals_cover_the_truth_as_often_as_they_say():
@@ -124,7 +125,7 @@ def test_a_constant_input_identifies_no_gain_and_no_delay_of_it():
         derivative=lambda s, a, p: {"x": s.v, "v": p.gain * a.force - 4.0 * s.x - p.d * s.v},
     )
     trials = simulated(SPRING, 5, NOISE, low=0.0, high=0.0)
-    found = fit(model, trials, fit_latency="each")
+    found = fit(model, trials, delays={"latency:force": (0,)})
     for name in ("gain", "latency:force"):
         assert not found.params[name].identified and np.isinf(found.params[name].std)
         assert any(name in one.about for one in found.findings if one.code == "model.not_told")
@@ -146,8 +147,6 @@ def test_misuse_says_what_to_do():
     trials = simulated(SPRING, 10, NOISE, B=1, T=20)
     with pytest.raises(GroundedError, match=holding("'kk'")):
         fit(SPRING, trials, ["kk"])
-    with pytest.raises(GroundedError, match=holding("known", "common", "each")):
-        fit(SPRING, trials, fit_latency="yes")
     with pytest.raises(GroundedError, match=holding("fit", 3)):
         fit(SPRING, [Trial(np.zeros((2, 2)), np.zeros((1, 1)), DT, ("x", "v"), ("force",))])
 
@@ -197,4 +196,5 @@ def test_the_real_dart_car_has_a_dead_zone():
     plain, found = fit(model, trials, ["gain", "tau"]), fit(model, trials)
     assert 0.12 < found.params["dead"].value < 0.22 and found.params["dead"].std < 0.02
     assert found.loglik > plain.loglik + 100
-    assert found.after.ahead[0] < 0.7 * plain.after.ahead[0]
+    less, more = (one.prediction_error[-1].with_effects["v"] for one in (found, plain))
+    assert less < 0.7 * more

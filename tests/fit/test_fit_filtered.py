@@ -61,5 +61,5 @@ def test_a_filter_of_speeds_is_not_fitted_as_friction():
     for name, value in TRUE.items():
         assert found.params[name].value == pytest.approx(value, rel=0.03)
         assert found.params[name].low < value < found.params[name].high
-    assert found.after.names == AXIS.state_names == found.model.state_names
+    assert tuple(found.prediction_error[-1].crude) == AXIS.state_names
     assert found.helps and {*found.params} == {*TRUE}

@@ -176,12 +176,12 @@ def test_fit_gives_intervals_and_errors_on_held_out_time_that_shrink(fitted):
         assert found["identified"] and found["unit"]
     # its driver gave more throttle where the car was slow: gain and idle can't be told apart
     assert not all(fitted["params"][name]["identified"] for name in ("gain", "idle"))
-    before, after = (fitted[f"prediction_error_{k}"] for k in ("before", "after"))
-    assert before["horizon_s"] == 1.0
+    step, ahead = fitted["prediction_error"]
+    assert ahead["horizon_s"] == 1.0
     for name in ("x", "y", "psi"):
-        assert after["one_step"][name] < 0.15 and before["one_step"][name] > 0
-        assert after["ahead"][name] < 0.8 * before["ahead"][name]
-    assert after["ahead"]["x"] < 0.15 and after["ahead"]["psi"] < 0.3
+        assert step["with_effects"][name] < 0.15 and step["crude"][name] > 0
+        assert ahead["with_effects"][name] < 0.8 * ahead["crude"][name]
+    assert ahead["with_effects"]["x"] < 0.15 and ahead["with_effects"]["psi"] < 0.3
 
 
 @pytest.mark.slow

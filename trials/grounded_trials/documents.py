@@ -25,6 +25,7 @@ from typing import (
 )
 
 from grounded.accounts.finding import Finding as Fault
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.parts import Diagnosis
 from grounded.findings import Finding, Quantity
 from grounded.findings.catalogue import Entry
@@ -148,14 +149,6 @@ class IngestJson(TypedDict):
     trials: list[Ingested]
 
 
-class ErrorsJson(TypedDict):
-    """Prediction errors of a fit."""
-
-    horizon_s: float
-    one_step: By
-    ahead: By
-
-
 class FitJson(TypedDict):
     """`fit`."""
 
@@ -166,8 +159,7 @@ class FitJson(TypedDict):
     samples: int
     at_bounds: list[str]
     applied: bool
-    prediction_error_before: NotRequired[ErrorsJson]
-    prediction_error_after: NotRequired[ErrorsJson]
+    prediction_error: list[RulerRow]
     trials: list[str]
     not_fitted: list[str]
     rows_s: float

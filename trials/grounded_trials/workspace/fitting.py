@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.diagnosis.error_report import errors
 from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, settle
+from grounded.findings import Finding, settle
 from grounded.findings import found as finding
 from grounded.fit import fit
 from grounded.result import Result
@@ -103,13 +104,13 @@ def fit_in(
     """
     planner, share, names = workspace.planner, chosen(workspace, trials), params
     used = share.trials
-    adopted = _adopted_delays(workspace)
+    adopted, every = _adopted_delays(workspace), tuple(range(planner.plan.model.m))
     rows, early = unsure_times(workspace.whole_trials(), ids_of(used))
     found = fit(
         planner.plan,
         [planner.lift(trial) for trial in used],
         names,
-        fit_latency="common" if latency else "known" if names else adopted,
+        delays={"latency": every} if latency else {} if names else adopted,
         hidden=planner.plan.model.state_names[planner.task.model.n :],
         one_message=one_message(workspace),
         interpolated_s=early,
@@ -184,14 +185,10 @@ def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
 
 def _worse(found: Fit) -> Finding:
     """Return how much worse a fit predicts, with the most affected state."""
-    before, after = found.before, found.after
-    assert before is not None and after is not None
-    ratio = np.nan_to_num(after.ahead / before.ahead, nan=-np.inf)
-    i = int(np.argmax(ratio))
-    unit = found.model.states.get(before.names[i], "")
-    now, then = (Quantity(float(errors.ahead[i]), unit) for errors in (after, before))
-    ahead = before.horizon_s
-    return finding("model.fit_worse", state=before.names[i], ahead=ahead, now=now, before=then)
+    row = found.prediction_error[-1]
+    name = max(row.changes, key=lambda name: row.changes[name])
+    ends = errors(row, name, now="with_effects", before="crude")
+    return finding("model.fit_worse", state=name, ahead=row.horizon_s, **ends)
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:

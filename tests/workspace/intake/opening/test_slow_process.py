@@ -73,4 +73,4 @@ def test_a_fit_moves_though_the_hidden_state_bends_the_gradient(tanks):
         TRUE["k4"] * TRUE["k2"] / TRUE["k1"], rel=0.05
     )
     assert all(e.low < TRUE[name] < e.high for name, e in found.params.items())
-    assert found.before.horizon_s == 10 * DT
+    assert found.prediction_error[-1].horizon_s == 10 * DT
