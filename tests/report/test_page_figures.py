@@ -152,8 +152,8 @@ def test_the_worth_of_each_effect_is_drawn_in_the_unit_of_the_state():
         with_effects={"x": 0.1, "v": 0.05},
         noise_floor={"x": 0.05, "v": 0.04},
     )
-    late = Credit("delay:u", share=0.9, times=2.43, without_it={"x": 0.15, "v": 0.4})
-    dry = Credit("dead_zone:u", share=0.1, times=1.1, without_it={"x": 0.11, "v": 0.06})
+    late = Credit("delay:u", share=0.9, without_it={"x": 0.15, "v": 0.4})
+    dry = Credit("dead_zone:u", share=0.1, without_it={"x": 0.11, "v": 0.06})
     verdict = Verdict("several", ("delay:u", "dead_zone:u"), ("late", "dry"))
     found = Diagnosis(verdict, credit=(late, dry), prediction_error=(row,))
     share, worth = credit_figure(found, 1).panels

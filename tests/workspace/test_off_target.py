@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from grounded import Model, Task, Trial
+from grounded.result import measured_alike
 from grounded.task import Reward
 from grounded_trials import Workspace
-from grounded_trials.report.findings import improvements_in
 from grounded_trials.report.gathering import gather
+from grounded_trials.report.tables import improved
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import off_target_of
 from reported import cart, copied
@@ -65,8 +66,10 @@ def test_status_and_ingest_say_the_number_of_the_page(cart, tmp_path):
     folder = copied(cart, tmp_path / "cart")
     w = Workspace(folder)
     (told, *_) = w.status().off_target
-    shown = next(one for one in improvements_in(gather(Folder(folder))) if told.what in one.what)
-    assert told.rms == pytest.approx(shown.after)
+    (first, *_) = off_target_of(w.task, [w.trials()[0].trial])
+    rows = dict(map(reversed, improved(gather(Folder(folder)))))
+    both = measured_alike([first.rms, told.rms], told.unit)
+    assert rows[f"{told.what} off target, rms"] == " -> ".join(both)
     document = w.status().to_json()["best"]["off_target"][0]
     assert (document["what"], document["rms"]) == (told.what, pytest.approx(told.rms))
     best = w.trials()[-1]

@@ -18,7 +18,7 @@ from grounded.diagnosis.telling import Told, sentence, told
 from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded.frozen import Array
-from grounded.result import begun, measured_alike
+from grounded.result import begun
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
@@ -26,22 +26,16 @@ from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 from grounded_trials.report.forecast import SECONDS
 from grounded_trials.store.store import Lost
-from grounded_trials.wording import rendered, shown
+from grounded_trials.wording import rendered
 from grounded_trials.workspace.last_diagnosis import Since
 from grounded_trials.workspace.next_step import BEFORE_TRIALS, outlook
-from grounded_trials.workspace.off_target import (
-    OffTarget,
-    off_target_of,
-    tracking_error,
-)
+from grounded_trials.workspace.off_target import tracking_error
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.adoption import Better
 
 One = TypeVar("One")
-SHOWN = 4  # largest number of rows of improvements
 ESTIMATED = "not measured: an estimate"  # note at a panel
-NOWHERE = OffTarget("", "")  # without a first trial
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,9 +83,7 @@ class Findings:
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # changes since the diagnosis
     adopted: tuple[tuple[str, str], ...] = ()  # name and values of what was adopted
-    discarded: tuple[str, ...] = ()  # trials that were set aside
     estimated: tuple[str, ...] = ()  # states that no sensor gives in some of these trials
-    uncounted: tuple[str, ...] = ()  # trials of another task or a probe, used only as data
     left_runs: int = 0  # runs that were not read, since there are too many
     left_logs: int = 0  # logs that were not read
     folder: str | None = None  # as the user named it, None for the current folder
@@ -151,16 +143,11 @@ class Findings:
     @property
     def plain(self) -> str:
         """The name of the task's model, which contains no adopted effects."""
-        changed = any(self.values[name] != value for name, value in self.nominal.items())
-        without = "without effects"
-        if changed:  # the diagnosis's "calibrated" is another: the best one without effects
-            return "present model" + f", {without}" * bool(self.effects)
-        return f"model {without}" if self.effects else "crude model"
-
-    @property
-    def values(self) -> dict[str, float]:
-        """The model's current parameters, by name."""
-        return {name: param.value for name, param in self.task.model.params.items()}
+        params = self.task.model.params
+        changed = any(params[name].value != value for name, value in self.nominal.items())
+        return f"{'present' if changed else 'crude'} model" + ", without effects" * bool(
+            self.effects
+        )
 
     @property
     def history(self) -> tuple[Tried, ...]:
@@ -219,46 +206,6 @@ def compared(findings: Findings) -> list[tuple[str, Run]]:
     if first is not None and best is not None and first.candidate is best.candidate:
         return [("model", first)]
     return [(role, run) for role, run in (("model", first), ("best", best)) if run is not None]
-
-
-@dataclass(frozen=True)
-class Improved:
-    """An error of the first and of the best trial; `before` is NaN if there is only one."""
-
-    what: str
-    unit: str
-    before: float
-    after: float
-
-    @property
-    def text(self) -> str:
-        """`170 mm -> 5.0 mm`: both in one unit, lengths below 1 m in mm."""
-        known = [v for v in (self.before, self.after) if np.isfinite(v)]
-        return " -> ".join(measured_alike(known, self.unit))
-
-
-def improvements_in(findings: Findings) -> list[Improved]:
-    """Return the errors from the target of the model's own policy and of the best trial.
-
-    They are those of `status`: rms over the run, and at the end where that is to be reached.
-    """
-    task, found = findings.task, list[Improved]()
-    runs = [findings.runs_of(run.candidate.id) for _, run in compared(findings)]
-    short = [one.label for own in runs for one in own if one.trial.finite_steps < task.horizon]
-    note = f"; {', '.join(short)} ended early" if short else ""
-    errors = [
-        {one.what: one for one in off_target_of(task, [run.trial for run in own])} for own in runs
-    ]
-    for what, last in errors[-1].items() if errors else ():
-        first, unit = errors[0].get(what, NOWHERE) if len(errors) > 1 else NOWHERE, shown(last.unit)
-        if np.isfinite(last.rms):
-            found.append(Improved(f"{what} off target, rms{note}", unit, first.rms, last.rms))
-        if np.isfinite(last.end):
-            least = last.noise  # a single sample can't show a smaller error
-            doubt = f", noise {measured_alike([least], unit)[0]}" if last.end < least else ""
-            ends = max(first.end, least), max(last.end, least)
-            found.append(Improved(f"{what} off target, end{doubt}{note}", unit, *ends))
-    return found[:SHOWN]
 
 
 def prediction_error(task: Task, run: Run) -> Array:

@@ -28,7 +28,7 @@ from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
-from grounded_trials.workspace.candidates.proposing import uncounted, undecided
+from grounded_trials.workspace.candidates.proposing import undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
@@ -89,9 +89,7 @@ def gather(workspace: Folder) -> Findings:
         better=better,
         since=since,
         adopted=adopted_rows(workspace, diagnosis),
-        discarded=tuple(workspace.discarded()),
         estimated=_estimated(task, contents, {t.id for t in [*shown, *logs]}),
-        uncounted=tuple(uncounted(workspace, contents.trials, now)),
         left_runs=len(own) - len(shown),
         left_logs=len(data) - len(logs),
         folder=workspace.address,

@@ -28,8 +28,6 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
 
     # the task, its trials, and what became better
     head = [f"{findings.name}: {about(findings)}", "; ".join(counted(findings))]
-    if findings.discarded:
-        head.append(f"set aside: {', '.join(findings.discarded)}")
     if findings.effects:
         head.append(f"adopted: {', '.join(findings.effects)}")
     lines = [line for text in head for line in wrapped(text, "", "  ")]

@@ -16,7 +16,7 @@ from grounded.diagnosis.telling import error_table as held_out_table
 from grounded.diagnosis.telling import weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
-from grounded.result import begun, listed
+from grounded.result import begun, listed, measured_alike
 from grounded.search.difference import Difference, last_gain
 from grounded.search.pictures import MOST_DRAWN, few, search_figure
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
@@ -30,7 +30,6 @@ from grounded_trials.report.figures.runs import (
 from grounded_trials.report.findings import (
     Findings,
     compared,
-    improvements_in,
     off_prediction,
     off_target,
     rms,
@@ -48,8 +47,8 @@ from grounded_trials.wording import (
     shown,
     with_unit,
 )
-from grounded_trials.workspace.candidates.proposing import not_counted
 from grounded_trials.workspace.next_step import DIAGNOSE
+from grounded_trials.workspace.off_target import off_target_of
 
 OPEN = 12  # largest number of candidates whose table is shown unfolded
 UNKNOWN = "–"
@@ -116,7 +115,6 @@ def counted(findings: Findings) -> list[str]:
         found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
     if logs:
         found.append(f"{count(logs, 'log')} of data")
-    found += [one.sentence for one in not_counted(findings.uncounted)]
     if findings.optimum is not None:
         found.append(f"optimum {figure(findings.optimum)}")
     for left, drawn, kind in (
@@ -130,8 +128,24 @@ def counted(findings: Findings) -> list[str]:
 
 
 def improved(findings: Findings) -> list[tuple[str, str]]:
-    """Return rows (value, text) of the errors and utility of the first and the best trial."""
-    rows = [(one.text, one.what) for one in improvements_in(findings)]
+    """Return rows (value, text) of the errors and utility of the first and the best trial.
+
+    The errors are those of `status`: rms over the run, and at the end where that is to be reached.
+    Both are in one unit, lengths below 1 m in mm.
+    """
+    rows, task = list[tuple[str, str]](), findings.task
+    runs = [[one.trial for one in findings.runs_of(r.candidate.id)] for _, r in compared(findings)]
+    errors = [{one.what: one for one in off_target_of(task, own)} for own in runs]
+    short = [t.id for own in runs for t in own if t.finite_steps < task.horizon]
+    note = f"; {', '.join(short)} ended early" if short else ""
+    for what, last in errors[-1].items() if errors else ():
+        for kind in ("rms", "end"):
+            values = [getattr(each[what], kind) for each in errors if what in each]
+            if math.isfinite(values[-1]):
+                texts = measured_alike([v for v in values if math.isfinite(v)], shown(last.unit))
+                rows.append((" -> ".join(texts), f"{what} off target, {kind}{note}"))
+
+    # the utility
     first, best = findings.first, findings.best
     if first is not None and best is not None and figure(first.utility) != figure(best.utility):
         gain, tried = "", {one.candidate.id: one for one in findings.history}
