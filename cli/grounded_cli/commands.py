@@ -126,22 +126,19 @@ def init() -> None:
     "--to",
     multiple=True,
     metavar="STATE=VALUE",
-    help="Where a line, step or swing-up ends; what a state keeps along a path (a height). "
+    help="Where a line or step ends; what a state keeps along a path (a height). "
     "A velocity along a line or path follows it, and must end at this value.",
 )
-@click.option(
-    "--seconds", type=float, help="Duration of a step or swing-up (5), or of a line to a STATE."
-)
+@click.option("--seconds", type=float, help="Duration of a step (5), or of a line to a STATE.")
 @flag("--rest", help="Let the states that a line leaves free rest at its end, by weights.")
 @details
 def target() -> None:
-    """Draw the manoeuvre: line, circle, figure-8, step or swing-up.
+    """Draw the manoeuvre: line, circle, figure-8 or step.
 
     FILE is a log, read through [log], a stored trial (t0001), or a CSV with columns `t` and states.
     Paths start from rest and keep to the given speeds and accelerations. A line with --to, or of a
     robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
-    --speed and --accel set its pace. A step begins at [task] start. A swing-up brings the first
-    angle that hangs under its weight upright; --to names another angle, or more states. A path
+    --speed and --accel set its pace. A step begins at [task] start. A path
     begins at the position in [task] start, along x, and a figure-8 at its crossing: its length lies
     45 degrees to the right of x.
 

@@ -17,8 +17,8 @@ PATHS = ("line", "circle", "figure-8")
 OF_SHAPES = {  # the shapes that an option is for
     **dict.fromkeys(("size", "speed", "accel", "hold"), PATHS),
     **dict.fromkeys(("lateral", "laps"), PATHS[1:]),
-    "seconds": ("line", "step", "swing-up"),
-    "to": (*PATHS, "step", "swing-up"),
+    "seconds": ("line", "step"),
+    "to": (*PATHS, "step"),
     "rest": PATHS[:1],
 }
 

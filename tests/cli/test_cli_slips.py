@@ -47,7 +47,7 @@ SLIPS = [
     (["inspect", "nowhere.mcap"], 1, "nowhere.mcap"),
     (["export", "best", "--format", "csv", "-o", "x.npz"], 2, "--format"),
     (["target", "line", "--to", "x=1", "--seconds", "1e9"], 1, "200000"),
-    (["target", "swing-up", "--hold", "1"], 2, "--hold"),
+    (["target", "step", "--hold", "1"], 2, "--hold"),
     (["target", "circle", "--seconds", "1"], 2, "--seconds"),
     *(
         (["target", "line", "--to", f"x={value}", "--seconds", "2"], 2, f"x={value}")

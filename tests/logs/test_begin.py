@@ -11,14 +11,12 @@ from rosbags.rosbag2 import StoragePlugin
 import workspaces
 from cli import grounded
 from facts import of_code
-from grounded import Model
 from grounded.errors import GroundedError
-from grounded.models.cart_pole import model as cart_pole
 from grounded_trials import Workspace
 from grounded_trials.logs.inspection.joint_names import from_base
 from grounded_trials.starting.begin import begin
 from grounded_trials.starting.kinds import KINDS
-from grounded_trials.starting.shapes import Drive, hinges, path_target, swing_up
+from grounded_trials.starting.shapes import Drive, path_target
 from grounded_trials.workspace.candidates.exporting import void_exports
 from grounded_trials.workspace.user_files.task_file import read_target
 from ros_bags import (
@@ -454,39 +452,17 @@ def test_a_robot_with_one_axis_has_a_line_and_a_step_from_its_start(tmp_path):
 def test_the_target_of_a_workspace_is_drawn_and_the_old_one_kept(tmp_path):
     grounded("init", tmp_path / "w", "--example", "pendulum")
     old = (tmp_path / "w/target.csv").read_text()
-    done = grounded("-C", tmp_path / "w", "target", "swing-up", "--seconds", 2, "--json").json
+    done = grounded(
+        "-C", tmp_path / "w", "target", "step", "--to", "theta=3.1416", "--seconds", 2, "--json"
+    ).json
     w = Workspace(tmp_path / "w")
-    assert w.task.horizon == done["horizon"] and w.task.target[1:, 0] == pytest.approx(np.pi)
+    assert w.task.horizon == done["horizon"] and w.task.target[1:, 0] == pytest.approx(3.1416)
     assert (tmp_path / "w/target.csv.bak").read_text() == old
     done = grounded("-C", tmp_path / "w", "target", "step", "--to", "theta=0.5", "--json").json
     assert done["columns"]["theta"] == [0.0, 0.5]
     for words in (["circle"], ["step", "--to", "x=1"], ["nowhere.mcap"]):
         done = grounded("-C", tmp_path / "w", "target", *words)
         assert done.code == 1 and done.err.startswith("error: ")
-
-
-def furuta(s, a, p):
-    """A motor turns an arm about the vertical; a pendulum hangs from its end."""
-    sine = np.sin(s.hung)
-    return {"arm": s.w, "hung": s.v, "w": a.volts - s.w, "v": np.cos(s.hung) * a.volts - 90 * sine}
-
-
-def test_a_swing_up_is_of_the_angle_that_hangs(tmp_path):
-    model = Model(
-        states={"arm": "rad", "hung": "rad", "w": "rad/s", "v": "rad/s"},
-        inputs={"volts": "V"},
-        params={},
-        derivative=furuta,
-    )
-    (found,) = hinges(model)
-    assert (found.angle, found.hangs, found.stands) == ("hung", 0.0, np.pi)
-    assert [one.angle for one in hinges(cart_pole)] == ["theta"]
-    assert (hinges(cart_pole)[0].hangs, hinges(cart_pole)[0].stands) == (np.pi, 0.0)
-    columns = swing_up(model, 0.1, 1.0, {"arm": 0.0}, {"hung": 0.2})
-    assert set(columns) == {"hung", "arm"} and columns["hung"].tolist() == [0.2] + [np.pi] * 10
-    grounded("init", tmp_path / "car", "--example", "car-turn")
-    refused = grounded("-C", tmp_path / "car", "target", "swing-up")
-    assert refused.code == 1 and "--to" in refused.err
 
 
 def test_a_recorded_run_becomes_the_target(tmp_path):

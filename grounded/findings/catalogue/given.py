@@ -7,8 +7,8 @@ from grounded.findings.catalogue import Entry
 ENTRIES: dict[str, Entry] = {
     "value": Entry(
         "refuse",
-        "{about} must be[[ {must:given=given,real=one real number,named=read by name,hinge=given, "
-        "since no angle hangs under its weight,level=those of a level flight,inside=inside the "
+        "{about} must be[[ {must:given=given,real=one real number,named=read by name,"
+        "level=those of a level flight,inside=inside the "
         "workspace,even=equally long,groups=two groups of different trials,"
         "plant=a dict input -> seconds and a whole number,words=a "
         "program with the words for both files,number=a number,units=names with a unit each,"

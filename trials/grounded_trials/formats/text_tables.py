@@ -12,20 +12,17 @@ from __future__ import annotations
 import codecs
 import csv
 import re
-import warnings
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.findings import Finding, Weight, found
-from grounded_trials.formats.messages import Floats
+from grounded.findings import Finding, found
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
     Layout,
@@ -40,7 +37,6 @@ from grounded_trials.within import within
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # bytes and characters that show the encoding and the separator
-BEFORE = 20  # rows before the last one that show how many digits its last cell should have
 NAMELESS = ("file.no_times",)  # which [log] says then
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
@@ -65,7 +61,7 @@ class AboutTable:
 
     units: Mapping[str, str]  # in column names, `x [m]` or `x (m)`, by message path
     in_time_units: bool  # its times are in seconds (`time_s`, `time [s]`), or times of day
-    findings: tuple[Finding, ...]  # an incomplete last row, a last column without numbers
+    findings: tuple[Finding, ...]  # an incomplete last row
 
 
 def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
@@ -74,23 +70,26 @@ def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     Raises:
         GroundedError: if names or times are missing, or a row has a wrong number of cells.
     """
-    table = _Table(path, layout.columns)
-    head = table.head
-    times = "" if layout.rate else _times_among(table)
-    table.check_widths()
-    rows = table.rows if table.cut is None else table.rows[: table.cut[0] - head.rows - 1]
-    stamps = None
-    try:
-        with warnings.catch_warnings():  # a table without rows is reported below
-            warnings.simplefilter("ignore")
-            width = range(len(head.names))
-            values = np.loadtxt(rows, delimiter=head.mark, ndmin=2, usecols=width)
-    except ValueError:
-        values, stamps = _with_texts(rows, head, times, path)
-    if not values.size:
+    lines = _lines(path)
+    head = _head_by(layout.columns, lines, path) if layout.columns else _head(lines, path)
+    time = "" if layout.rate else _times_among(head, lines, path)
+    cut, width = _cut(lines, head), len(head.names)
+    date = next((i for i, n in enumerate(head.names) if n.lower() in DATES and n != time), None)
+
+    # The numbers; times are texts if the first one is.
+    numbers, texts = array("d"), list[tuple[int, str, str]]()
+    for line, cells in _rows(lines[: cut[0] - 1] if cut else lines, head):
+        if any(cells[width:]) or len(cells) < width:
+            raise _misfit(path, line, cells, head)
+        numbers.extend(_number(cell, head.mark) for cell in cells[:width])
+        text = cells[head.names.index(time)] if time else ""
+        if texts or (len(numbers) == width and text and np.isnan(_number(text, head.mark))):
+            texts.append((line, text, "" if date is None else cells[date]))
+    if not numbers:
         raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
+    values = np.array(numbers).reshape(-1, width)
     columns: dict[str, Any] = columns_by_name(zip(head.names, values.T, strict=True), path)
-    return {"/csv": columns if stamps is None else columns | {times: stamps}}
+    return {"/csv": columns | ({time: _stamps(texts, time, path)} if texts else {})}
 
 
 def about_table(path: Path) -> AboutTable:
@@ -105,79 +104,42 @@ def about_table(path: Path) -> AboutTable:
 
 
 def _about(path: Path) -> AboutTable:
-    table = _Table(path)
-    head, odd, name = table.head, list[Finding](), str(path)
+    lines = _lines(path)
+    head = _head(lines, path)
     said = {
         name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
         for name, cell in zip(head.names, head.cells, strict=True)
     }
     units = {f"/csv.{name}": m[1] for name, m in said.items() if m and '"' not in m[1]}
-    if table.empty_last():
-        facts: dict[str, Any] = {"name": head.cells[-1], "line": head.line}
-        odd.append(found("file.empty_column", name, **facts, weight=Weight.WARN))
-    if table.cut is not None:
-        odd.append(found("file.cut", name, line=str(table.cut[0]), text=table.cut[1][:80]))
-    row = next((_cells(row, head.mark) for row in table.rows if row.strip()), [])
+    cut = _cut(lines, head)
+    odd = [found("file.cut", str(path), line=str(cut[0]), text=cut[1][:80])] if cut else []
+    row = next((cells for _, cells in _rows(lines[: head.rows + PREAMBLE], head)), [])
     at = head.names.index(time) if (time := _time_in(head)) else len(head.names)
     named = any(SECONDS.search(cell.lower()) for cell in head.cells[at : at + 1])
     return AboutTable(units, named or ":" in "".join(row[at : at + 1]), tuple(odd))
 
 
-class _Table:
-    """A text table: its head, and the lines of its rows."""
+def _rows(lines: Sequence[str], head: _Head) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows that are not blank with their line numbers, from 1."""
+    rows = csv.reader(lines[head.rows :], delimiter=head.mark)
+    for number, cells in enumerate(rows, start=head.rows + 1):
+        if any(cell.strip() for cell in cells):
+            yield number, [cell.strip() for cell in cells]
 
-    def __init__(self, path: Path, columns: Sequence[str] = ()) -> None:
-        self.path = path
-        lines = _lines(path)
-        self.ended = not lines[-1]  # with a line end
-        self.head = _head_by(columns, lines, path) if columns else _head(lines, path)
-        self.rows = lines[self.head.rows :]
 
-    def numbered(self) -> Iterator[tuple[int, str]]:
-        """Yield the rows that are not blank with their line numbers, from 1."""
-        lines = enumerate(self.rows, start=self.head.rows + 1)
-        return ((number, line) for number, line in lines if line.strip())
+def _cut(lines: Sequence[str], head: _Head) -> tuple[int, str] | None:
+    """Return a last row whose writer was interrupted: its line number, and what is left of it.
 
-    def check_widths(self) -> None:
-        """Check that no row has more cells than names; empty ones at its end don't count.
-
-        Raises:
-            GroundedError: if one has, or if a column without a name has the numbers that the last
-                one lacks, so that it is unclear which cell belongs to which name.
-        """
-        head = self.head
-        for number, line in self.numbered():
-            if line.count(head.mark) >= len(head.names):
-                cells = _cells(line, head.mark)
-                if any(cells[len(head.names) :]):
-                    raise _misfit(self.path, number, cells, head)
-        if "" in head.names and self.empty_last():
-            facts: dict[str, Any] = {"line": head.line, "name": head.cells[-1]}
-            facts["column"] = head.names.index("") + 1
-            raise GroundedError(found("file.empty_column", str(self.path), **facts))
-
-    def empty_last(self) -> bool:
-        """Return whether the last column is empty in every row, which ends with a separator."""
-        mark, width = self.head.mark, len(self.head.names)
-        rows = (line.strip(" ") for _, line in self.numbered())
-        return all(row.endswith(mark) and row.count(mark) < width for row in rows)
-
-    @cached_property
-    def cut(self) -> tuple[int, str] | None:
-        """A last row whose writer was interrupted: its line number, and what is left of it.
-
-        It has too few cells, or, without a line end, half a number.
-        """
-        mark, last = self.head.mark, deque(self.numbered(), maxlen=BEFORE + 1)
-        if not last:
-            return None
-        (number, line), before = last[-1], [_cells(line, mark) for _, line in last][:-1]
-        text = line.strip(" \t\0")
-        cells = _cells(text if "\0" in line else line, mark)
-        whole = self.ended or not all(len(row) == len(cells) for row in before)
-        short = len(cells) < len(self.head.names)
-        half = not (whole or _ends(cells[-1], [row[-1] for row in before]))
-        return (number, text) if short or half else None
+    It has too few cells, or, without a line end, no number where the row before has one.
+    """
+    there = [i for i in range(len(lines) - 1, head.rows - 1, -1) if lines[i].strip()][:2]
+    if not there:
+        return None
+    text = lines[there[0]].strip(" \t\0")
+    last, *before = (_cells(lines[i].strip(" \t\0"), head.mark) for i in there)
+    ends = [np.isnan(_number(cells[-1], head.mark)) for cells in (last, *before) if cells]
+    half = bool(lines[-1]) and ends == [True, False]
+    return (there[0] + 1, text) if half or len(last) < len(head.names) else None
 
 
 def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> GroundedError:
@@ -187,15 +149,6 @@ def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> Grounde
     comma = twice and all("." not in cell and _share([cell]) == 1 for cell in cells)
     facts: dict[str, Any] = {"line": line, "has": has, "names": names, "comma": int(comma)}
     return GroundedError(found("file.row", str(path), **facts))
-
-
-def _ends(cell: str, before: Sequence[str]) -> bool:
-    """Check whether the last cell of a file is as complete as those above it."""
-    if any(np.isnan(_number(one)) for one in before):
-        return True  # texts or empty cells
-    digits = {len(one.partition(".")[2]) for one in before}
-    fixed = len(digits) == 1 and len(before) >= BEFORE
-    return not np.isnan(_number(cell)) and not (fixed and len(cell.partition(".")[2]) < min(digits))
 
 
 def _lines(path: Path) -> list[str]:
@@ -290,7 +243,7 @@ def _any_time(cells: Sequence[str]) -> bool:
 def _share(cells: Sequence[str]) -> float:
     """Return the share of non-empty cells that hold a number or a time."""
     full = [cell for cell in cells if cell]
-    held = [c for c in full if not np.isnan(_number(c.replace(",", ".", 1))) or _moment(c)]
+    held = [c for c in full if not np.isnan(_number(c, ";")) or _moment(c)]
     return len(held) / max(len(full), 1)
 
 
@@ -299,48 +252,23 @@ def _time_in(head: _Head) -> str:
     return time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
 
 
-def _times_among(table: _Table) -> str:
+def _times_among(head: _Head, lines: Sequence[str], path: Path) -> str:
     """Return the name of the column of times.
 
     Raises:
         GroundedError: if there is none, suggesting a column whose values increase.
     """
-    head = table.head
     if named := _time_in(head):
         return named
-    rows = [_cells(row, head.mark) for row in table.rows[:PREAMBLE] if row.strip()]
-    rising = [n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows])]
+    rows = [cells for _, cells in _rows(lines[: head.rows + PREAMBLE], head)]
+    rising = (n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows]))
     names = tuple(filter(None, head.names[:8]))
-    rises = rising[0] if rising else ""
-    raise GroundedError(found("file.no_times", str(table.path), names=names, rises=rises))
+    raise GroundedError(found("file.no_times", str(path), names=names, rises=next(rising, "")))
 
 
 def _rises(cells: Sequence[Sequence[str]]) -> bool:
-    values = [_number(cell[0].replace(",", ".", 1)) for cell in cells if cell]
+    values = [_number(cell[0], ";") for cell in cells if cell]
     return len(values) > 2 and bool(np.all(np.diff(values) > 0))
-
-
-def _with_texts(lines: Iterable[str], head: _Head, times: str, path: Path) -> tuple[Floats, Any]:
-    """Read rows with texts or empty cells as NaN, and times [ns] if these are texts, else None."""
-    rows: list[list[float]] = []
-    width, at = len(head.names), head.names.index(times) if times else -1
-    date = next((i for i, n in enumerate(head.names) if n.lower() in DATES and i != at), None)
-    texts: list[tuple[int, str, str]] = []
-    for number, row in enumerate(csv.reader(lines, delimiter=head.mark), start=head.rows + 1):
-        if not any(cell.strip() for cell in row):
-            continue
-        if not any(row[width:]):
-            row = row[:width]
-        if len(row) != width:
-            raise _misfit(path, number, row, head)
-        texts.append((number, row[at] if times else "", "" if date is None else row[date]))
-        if head.mark != ",":  # decimal comma
-            row = [cell.replace(",", ".", 1) if "." not in cell else cell for cell in row]
-        rows.append([_number(cell) for cell in row])
-    values = np.array(rows, dtype=float).reshape(-1, width)
-    if not times or np.isfinite(values[:, at]).any() or not rows:
-        return values, None  # times are numbers; missing ones are reported later
-    return values, _stamps(texts, times, path)
 
 
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:
@@ -375,8 +303,11 @@ def _moment(text: str) -> datetime | None:
     return moment.replace(tzinfo=moment.tzinfo or UTC)
 
 
-def _number(cell: str) -> float:
+def _number(cell: str, mark: str) -> float:
+    """Return a cell's number, NaN for another text; 0,5 is one if no comma separates columns."""
     try:
         return float(cell)
     except ValueError:
-        return float({"true": 1, "false": 0}.get(cell.strip().lower(), "nan"))
+        if mark != "," and "," in cell and "." not in cell:
+            return _number(cell.replace(",", ".", 1), mark)
+        return float({"true": 1, "false": 0}.get(cell.lower(), "nan"))

@@ -2,7 +2,7 @@
 
 Read `begin.py` first: it creates a workspace from a log. `kinds.py` guesses the kind of robot from
 a log and chooses a model skeleton; `shapes.py` draws targets: lines, circles, figure-8s, steps,
-swing-ups, and `drawing.py` reads one from a run. `blank.py` creates a workspace from a model alone,
+and `drawing.py` reads one from a run. `blank.py` creates a workspace from a model alone,
 `examples.py` the examples that come with grounded; `first_toml.py` writes the grounded.toml of a
 log's workspace, `examples.py` all others.
 """

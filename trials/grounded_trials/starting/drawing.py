@@ -30,7 +30,6 @@ from grounded_trials.starting.shapes import (
     line_target,
     path_target,
     step_target,
-    swing_up,
 )
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
@@ -103,7 +102,7 @@ def _holds(table: Path, mapping: LogMapping) -> bool:
     return all(s.path in known for s in (*mapping.states.values(), *mapping.inputs.values()))
 
 
-SECONDS = 5.0  # default duration of a step or a swing-up
+SECONDS = 5.0  # default duration of a step
 STRAIGHT = 1e3  # times its size: larger turning radii are those of a straight line
 OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
@@ -119,7 +118,7 @@ class Manoeuvre:
         shape: one of `shapes.SHAPES`, a stored trial, or a file of a log or of columns.
         drive: size and pace of a path.
         to: where states end, or what they keep along a path.
-        seconds: duration of a step, a swing-up or a line to a state; None: 5 s, or by the pace.
+        seconds: duration of a step or a line to a state; None: 5 s, or by the pace.
         paces: those of `drive` that were asked for, among speed and accel.
         rest: whether the states that a line leaves free rest at its end.
     """
@@ -244,8 +243,6 @@ def _columns(workspace: Folder, asked: Manoeuvre, start: Mapping[str, float]) ->
         return line_target(asked.to, start, asked.drive, model, dt, asked.seconds, pace)
     if shape == "step":
         return step_target(asked.to, model, dt, long, start)
-    if shape == "swing-up":
-        return swing_up(model, dt, long, asked.to, start)
     if asked.seconds is not None:
         raise GroundedError(found("given.either", "--seconds", shape, how="one"))
     if asked.is_path:

@@ -1,4 +1,4 @@
-"""Draws targets: paths with limited speed and acceleration, steps, swing-ups.
+"""Draws targets: paths with limited speed and acceleration, and steps.
 
 A path is parametrised by its length. The speed starts at zero, rises with `accel`, and is limited
 by `speed` and, in curves, by sqrt(lateral / curvature). Every state with one of the roles position,
@@ -17,19 +17,18 @@ from grounded import places
 from grounded.checks import known, positive, refused, wrong
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import integrals, rate_states
+from grounded.places import rate_states
 from grounded.places import velocities as velocities_of
 from grounded.task import MAX_HORIZON
 from grounded_trials.workspace.off_target import position_names
 
 PATHS = ("line", "circle", "figure-8")
-SHAPES = (*PATHS, "step", "swing-up")
+SHAPES = (*PATHS, "step")
 FEWEST = 5  # control steps of a target; at most MAX_HORIZON
 FINE = 2000  # number of points of a path
-AROUND = 720  # angles at which a hinge is tried
 SAME_VELOCITY = 1e-6  # of a velocity: two are the same
 CARRIES = 0.02  # of a path's highest rate: a velocity that makes up for less does not carry it
-BRIEF, SLIGHT = 1e-4, 1e-3  # [s] of the step there; [rad/s^2] smallest pull of its weight
+BRIEF = 1e-4  # [s] of the step there
 
 
 @dataclass(frozen=True)
@@ -364,95 +363,3 @@ def step_target(
 def _check_states(to: Mapping[str, float], model: Model) -> None:
     for name in to:
         known("state", [name], model.states, "the model")
-
-
-@dataclass(frozen=True)
-class Hinge:
-    """An angle that hangs under its weight.
-
-    Args:
-        angle: the state.
-        hangs: the angle at which it hangs at rest [rad].
-        stands: the angle near 0 at which it stands upright, 0 to a turn away from there [rad].
-    """
-
-    angle: str
-    hangs: float
-    stands: float
-
-
-def hinges(model: Model, start: Mapping[str, float] = MappingProxyType({})) -> list[Hinge]:
-    """Return the angles that hang under their weight and can stand upright.
-
-    Each angle is turned once around, all else at rest at `start` (0 where unset) without inputs.
-    Where its acceleration changes sign from plus to minus it hangs, from minus to plus it stands.
-    An arm that turns about a vertical axis, a heading or a spring-held angle has no such pair.
-    """
-    at = np.array([start.get(name, 0.0) for name in model.states])
-    units, names, found = list(model.states.values()), list(model.states), []
-    around = np.linspace(-np.pi, np.pi, AROUND, endpoint=False) + np.pi / AROUND
-    for one in integrals(model):
-        if not one.exact or units[one.i] != "rad":
-            continue
-        x = np.tile(at, (AROUND, 1))
-        x[:, one.i] = at[one.i] + around
-        with np.errstate(all="ignore"):
-            after = model.system.step(x, np.zeros((AROUND, model.m)), model.values, BRIEF)
-        pulled = (after[:, one.j] - x[:, one.j]) * one.c
-        if not np.isfinite(pulled).all() or np.ptp(pulled) < SLIGHT * BRIEF:
-            continue
-        other = np.roll(pulled, -1)
-        middle = x[:, one.i] + np.pi / AROUND
-        stable = middle[(pulled > 0) & (other <= 0)]
-        unstable = middle[(pulled < 0) & (other >= 0)]
-        if len(stable) and len(unstable):
-            hangs = float(stable[np.argmin(np.abs(stable - at[one.i]))])
-            up = hangs + float(((unstable - hangs) % (2 * np.pi)).min())
-            stands = up if abs(up) <= abs(up - 2 * np.pi) + SLIGHT else up - 2 * np.pi
-            found.append(Hinge(names[one.i], *_round(hangs, stands)))
-    return found
-
-
-def _round(*angles: float) -> list[float]:
-    """Return angles, those near a multiple of a quarter turn exactly so."""
-    near = [round(a / (np.pi / 2)) * (np.pi / 2) for a in angles]
-    return [n if abs(a - n) < 3 * np.pi / AROUND else a for a, n in zip(angles, near, strict=True)]
-
-
-def swing_up(
-    model: Model,
-    dt: float,
-    seconds: float,
-    to: Mapping[str, float] = MappingProxyType({}),
-    start: Mapping[str, float] = MappingProxyType({}),
-) -> dict[str, Array]:
-    """Return a column that takes the first angle that hangs to upright.
-
-    The first row is `start`, or hanging. Other states are free, also the angle's rate: a weight on
-    it would punish the swing, and an angle that stays upright is at rest.
-
-    Args:
-        model: whose angle swings.
-        dt: control interval [s].
-        seconds: duration [s].
-        to: more states and their values; an angle that hangs is then the one to swing up.
-        start: [task] start.
-
-    Raises:
-        GroundedError: if no angle of the model hangs under its weight and `to` names none, if `to`
-            names the rate of one that swings up, or for an unusable number of steps.
-    """
-    hung = hinges(model, start)
-    chosen = [one for one in hung if one.angle in to] or hung[:1]
-    if not chosen and not any(model.states.get(name) == "rad" for name in to):
-        raise wrong("--to", must="hinge", like="--to q=3.1416")
-    first = np.arange(in_steps(seconds, dt, np.round(seconds / dt)) + 1) < 1
-    columns, rates = {}, rate_states(model)
-    for one in chosen:
-        if (rate := rates.get(one.angle, "")) in to:
-            facts = {"asked": f"{to[rate]:g}", "why": "swing"}
-            raise refused("start.follows_path", rate, **facts)
-        hangs = start.get(one.angle, one.hangs)
-        columns[one.angle] = np.where(first, hangs, to.get(one.angle, one.stands))
-    others = {name: value for name, value in to.items() if name not in columns}
-    return columns | (step_target(others, model, dt, seconds, start) if others else {})
