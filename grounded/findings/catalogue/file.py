@@ -62,11 +62,6 @@ ENTRIES: dict[str, Entry] = {
         "[[export it with a point as decimal sign, or with semicolons or tabs between the "
         "columns{comma:1=}]]",
     ),
-    "empty_column": Entry(
-        "refuse",
-        "{about}: '{name}' is empty in every row[[, while column {column} has no name]]",
-        "correct line {line}, which seems to have one name too many",
-    ),
     "rows": Entry(
         "refuse",
         "{about} has {rows} rows below its header[[, expected {needs} or more]]",

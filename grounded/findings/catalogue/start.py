@@ -33,8 +33,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "steps": Entry(
         "note",
-        "[[with it the model's steps fit {share:%} better than the next best]][[!share? the "
-        "model's steps don't clearly favour one]]",
+        "with it the model's steps fit {share:%} better than the next best",
     ),
     "given": Entry("note", "as you specified"),
     "unused": Entry(
