@@ -1,6 +1,5 @@
 """`fit` in a workspace: the sensors first, nothing written that predicts worse, no round trips."""
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +12,6 @@ from grounded.rollout import simulate
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.last_diagnosis import usable_ids
-from reported import diagnosed
 from workspaces import make
 
 DT = 0.05
@@ -56,23 +53,6 @@ def misled(tmp_path: Path) -> Workspace:
     return logs(tmp_path / "w", [1.4] * 3 + [1.0] * 7, alike=3)
 
 
-def claimed(w: Workspace, after: float = 0.1, named: Sequence[str] = ()) -> None:
-    """A diagnosis of today's trials and model that says that the mass should be 1.2 kg."""
-    mass = {"value": 0.2, "std": 0.01, "interval": [0.18, 0.22]}
-    row = {"effect": "parameter:mass", "params": {"d": mass}, "claimed": True, "evidence": 40.0}
-    errors = {"crude": {"x": 0.3}, "with_effects": {"x": after}, "unit_by_channel": {"x": "m"}}
-    made = {"trials": usable_ids(w), "adopted": [], "params": {}, "nominal": {"mass": 1.0}}
-    w.reports.mkdir(exist_ok=True)
-    diagnosed(
-        w.folder,
-        verdict={"kind": "effect", "effects": ["parameter:mass"], "sentence": "One."},
-        ranking=[row],
-        parameters={},
-        prediction_error=[{"horizon_s": 1.0, "held_out": "trials"} | errors],
-        diagnosed=made | {"named": list(named)},
-    )
-
-
 def test_what_the_sensors_filter_is_corrected_before_parameters_are_fitted(tmp_path):
     w = logs(tmp_path / "w", [1.4] * 6, filtered)
     (seen,) = w.preflight()
@@ -95,28 +75,3 @@ def test_values_that_predict_worse_are_never_written(misled):
     done = grounded("-C", misled.folder, "fit", "--params", "mass", "--apply")
     assert done.code == 1 and "Traceback" not in done.err
     assert misled.config.file.read_text() == before
-
-
-def test_the_fit_after_a_diagnosis_of_some_trials_is_of_the_same_trials(misled):
-    some = ["t0001", "t0004", "t0005", "t0006"]
-    claimed(misled, named=some)
-    asked = NextCommand("fit", ("--trials", ",".join(some)))
-    assert misled.status().then == asked
-    misled.fit()  # of other trials
-    assert misled.status().then == asked
-    assert not misled.fit(trials=some).fit.helps
-    assert misled.status().then == NextCommand("adopt", ("parameter:mass",))
-
-
-def test_a_fit_in_vain_is_not_asked_for_again(misled):
-    claimed(misled)
-    assert misled.status().then == NextCommand("fit")
-    adopt = NextCommand("adopt", ("parameter:mass",))
-    assert misled.fit(["mass"]).then == NextCommand("fit")  # which was not of everything
-    assert misled.fit().then == adopt
-    assert misled.status().then == adopt
-    claimed(misled, after=0.5)  # which predicts worse, too
-    assert misled.status().then.verb not in ("fit", "adopt", "diagnose")
-    claimed(misled)
-    (misled.reports / "adoptions.json").write_text("[")
-    assert misled.status().then == NextCommand("fit")

@@ -107,7 +107,7 @@ FOLLOWS = {
     "two effects": (TWO, "adopt viscous_friction:v delay:force"),
     "nothing": ({"verdict": NONE}, "export best --runner"),
     "too little": (UNKNOWABLE, "run best"),
-    "a parameter": ({"verdict": one_effect("parameter:mass")["verdict"]}, "fit"),
+    "a parameter": ({"verdict": one_effect("parameter:mass")["verdict"]}, "adopt parameter:mass"),
     "another model": ({"diagnosed": {"trials": [], "params": {"mass": 9.0}}}, "diagnose"),
     "a weaker gain": (one_effect("input_gain:force", g=-0.1), "adopt input_gain:force"),
     "a wrong sign": (one_effect("input_gain:force", g=-1.9), "diagnose"),

@@ -80,9 +80,7 @@ ENTRIES: dict[str, Entry] = {
     "diagnose": Entry("note", MODEL),
     "adopt_first": Entry(
         "note",
-        "a better model may gain more: [[fit? fit its parameters, which alone the diagnosis "
-        "blames]]"
-        "[[!fit? adopt what this one lacks]]",
+        "a better model may gain more: adopt what this one lacks",
     ),
     # what status tells beside it
     "uncounted": Entry(

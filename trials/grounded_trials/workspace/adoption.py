@@ -18,24 +18,19 @@ from typing import Any
 
 from grounded.checks import refused, unknown
 from grounded.diagnosis.causes import sign_only
-from grounded.diagnosis.error_report import gain
 from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
-from grounded.fit import Fit
 from grounded.model import Model
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
-from grounded.trial import Trial
 from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopted import in_order, installed_effects, planner_of, settled
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
-    chosen,
-    ids_of,
     made_from,
     newer_alone,
     read_diagnosis,
@@ -161,13 +156,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     if any(sign_only(row.effect, row.params) for row in rows):
         return AGAIN
 
-    # Only parameters: they are all fitted together, unless that was done without a gain.
-    if {f"parameter:{name}" for name in workspace.base_model.params}.issuperset(new):
-        some = (*made.named, *made.compared)
-        if not table.effects and not fitted_in_vain(workspace, some):  # else adopted beside them
-            return NextCommand("fit", ("--trials", ",".join(some)) if some else ())
-        if gain(diagnosis.prediction_error, "crude", "with_effects") <= 0:
-            return alone
     return NextCommand("adopt", (*new, *late))
 
 
@@ -179,7 +167,7 @@ def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | Non
     if diagnosis is None or since_diagnosis(workspace, diagnosis).changed:
         return None
     then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.causes or diagnosis.effects
-    if then is None or then.verb not in ("adopt", "fit") or not clauses:
+    if then is None or then.verb != "adopt" or not clauses:
         return None
     command = rendered(then, workspace.address)
     more = len(clauses) - 1
@@ -421,7 +409,6 @@ class Kept(Document):
     adoptions: tuple[Step, ...] = ()  # those that can be undone, oldest first
     undone: tuple[str, ...] = ()  # effects that were undone since the last diagnosis
     values: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # with their std
-    in_vain: str = ""  # the model and the trials of the last fit of all parameters, if it had none
 
 
 def kept(workspace: Folder) -> Kept:
@@ -459,33 +446,6 @@ def diagnosed_again(workspace: Folder) -> None:
     """Forget which effects were undone: a newer diagnosis may claim them again."""
     if kept(workspace).undone:
         keep(workspace, undone=())
-
-
-def keep_fit(workspace: Folder, used: Sequence[Trial], found: Fit) -> None:
-    """Keep of which model and trials a fit of all parameters predicts no better."""
-    vain = "" if found.helps else _fit_of(workspace, ids_of(used))
-    if vain != _readable(workspace).in_vain:
-        keep(workspace, in_vain=vain)
-
-
-def fitted_in_vain(workspace: Folder, trials: Sequence[str] = ()) -> bool:
-    """Return whether the current model was already fitted to the same trials without a gain.
-
-    Args:
-        workspace: the workspace.
-        trials: short names; empty: all usable trials.
-    """
-    vain = _readable(workspace).in_vain
-    if not vain.startswith(workspace.planner.fingerprint):
-        return False
-    try:
-        return vain == _fit_of(workspace, ids_of(chosen(workspace, trials).trials))
-    except GroundedError:  # then fit again
-        return False
-
-
-def _fit_of(workspace: Folder, trials: Sequence[str]) -> str:
-    return " ".join([workspace.planner.fingerprint, *trials])
 
 
 def _told_std(

@@ -21,7 +21,7 @@ from grounded.findings import found as finding
 from grounded.fit import fit
 from grounded.result import Result
 from grounded_trials.workspace.adopted import settled
-from grounded_trials.workspace.adoption import keep, keep_fit, not_adopted
+from grounded_trials.workspace.adoption import keep, not_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import chosen, ids_of, readable_diagnosis
@@ -123,8 +123,6 @@ def fit_in(
         found = replace(found, findings=(*found.findings, share.finding))
     seen = where_to_mend(workspace, used, found.preflight)
     kept = () if names or latency else _taken_as_exact(workspace, found)
-    if not (names or latency):
-        keep_fit(workspace, used, found)
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
@@ -134,10 +132,12 @@ def fit_in(
         raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
         lacks = not_adopted(workspace, readable_diagnosis(workspace.reports))
-        if lacks is not None and lacks.then is not None and lacks.then.verb == "adopt":
+        asks = lacks.then if lacks else None
+        own = {f"parameter:{name}" for name in workspace.base_model.params}
+        if lacks is not None and asks is not None and not own.issuperset(asks.arguments):
             # parameters alone stand for what the last diagnosis has found beside them
             told = replace(found, findings=(*found.findings, lacks))
-            return replace(fitted(applied=False, then=lacks.then), fit=told)
+            return replace(fitted(applied=False, then=asks), fit=told)
         if not found.helps:
             return fitted(applied=False, then=after_fit(workspace))
         return fitted(applied=False, then=NextCommand("fit", (*asked, "--apply")))

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 DIAGNOSE = NextCommand("diagnose")
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
-BEFORE_TRIALS = ("adopt", "fit", "discard")  # verbs of commands that come before another trial
+BEFORE_TRIALS = ("adopt", "discard")  # verbs of commands that come before another trial
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +168,8 @@ NEXT: tuple[Row, ...] = (
 def outlook(now: Standing, then: NextCommand) -> Standing:
     """Return the standing; of a search that has ended, also that the model may change."""
     goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT)
-    if then.verb == "fit" or (then.verb == "adopt" and not goes_on):
-        return now.with_finding(found("search.adopt_first", then=then, fit=then.verb == "fit"))
+    if then.verb == "adopt" and not goes_on:
+        return now.with_finding(found("search.adopt_first", then=then))
     return now
 
 
