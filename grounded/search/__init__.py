@@ -11,5 +11,5 @@ planner       the model used for planning, with adopted effects
 safety        checks a candidate before it is handed out
 pictures      figures of the search
 step/         the next step: its size, its direction, and the derivatives behind that
-feedback/     gains that a real robot bears: oscillation, noise, old samples
+feedback      gains that a real robot bears: oscillation, noise, old samples
 """

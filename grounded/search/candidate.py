@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
-    "slopes by step",  # with derivatives corrected step by step (`by_step`)
+    "slopes by step",  # with derivatives corrected step by step (`believed_by_step`)
     "gentler gains",  # the incumbent's plan with lower gains (`Maker.gentler`)
     "own plan",  # the plan of a model changed since the incumbent was planned (`About.own_plan`)
 ]

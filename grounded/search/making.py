@@ -14,9 +14,7 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
-from grounded.search.feedback.margin import steadied
-from grounded.search.feedback.oscillation import between_limits, limit_cycle
-from grounded.search.feedback.sample_age import planned_age, run_ages
+from grounded.search.feedback import between_limits, limit_cycle, planned_age, run_ages, steadied
 from grounded.search.noise import beyond_noise
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
@@ -87,7 +85,7 @@ class About:
         self.alternatives: tuple[Alternative, ...] = ()
         self._known_costs: dict[Policy, float] = {}  # in the alternatives
         if way == BY_STEP:
-            from grounded.search.step.by_step import believed_by_step
+            from grounded.search.step.mispredictions import believed_by_step
 
             if found := believed_by_step(planner, incumbent, make.now.history, self.real):
                 self.real, self.corrected = found.problem, found.corrected

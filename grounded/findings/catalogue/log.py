@@ -243,10 +243,10 @@ ENTRIES: dict[str, Entry] = {
     ),
     "stored": Entry(
         "refuse",
-        "{about} is stored already, as {trial}[[ ({used})]][[part?, a part of it]][[other?, read "
-        "in another way (another [log], [estimate], [task] dt or --before)]]",
+        "{about} is stored already, as {trial}[[ ({used})]][[other?, read in another way "
+        "(another [log], [estimate], [task] dt or --before)]]",
         "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted} all the "
-        "same, discard {trial} and ingest it again]][[part? discard that and ingest this]]"
+        "same, discard {trial} and ingest it again]]"
         "[[other? discard {trial} and ingest it again]]",
     ),
     "not_estimated": Entry(

@@ -4,9 +4,8 @@
 
 where dx, du are the differences from the incumbent's trial. Along that trial y is zero, so it is
 still replayed exactly. y and the previous input are not measured; the state is [x, y, u before].
-Gains on them are dropped from a policy, their part of the feed-forward stays. If the law is
-uncertain (`by_step`), the state also contains e_{t+1} = R_t [dx_t, du_t], and e' e is a cost. f is
-the compiled model; the backward sweep and the rollouts run in NumPy (`interpreted`).
+Gains on them are dropped from a policy, their part of the feed-forward stays. f is the compiled
+model; the backward sweep and the rollouts run in NumPy (`interpreted`).
 
 Each step of such a system takes as long for twenty runs as for one. A check of gains needs hundreds
 of runs, which took a minute of CPU one after the other; `runs` makes them together.
@@ -33,7 +32,7 @@ Flags = NDArray[np.bool_]
 
 
 class Corrected(System):
-    """A system of n states and m inputs, with 2 n + m + q states.
+    """A system of n states and m inputs, with 2 n + m states.
 
     Rows of `step`, `linearise` and `sensitivities` are the steps of the horizon, in order.
 
@@ -43,30 +42,17 @@ class Corrected(System):
         x: states of the incumbent's trial (H, n).
         u: what its actuators received (H, m).
         before: the same, one step earlier (H, m).
-        doubt: R (H, q, n + m), whose square is the cost to be expected of the law's errors; None
-            for none, q = 0.
     """
 
     how, note = "corrected", ""
 
-    def __init__(
-        self,
-        base: System,
-        law: Array,
-        x: Array,
-        u: Array,
-        before: Array,
-        doubt: Array | None = None,
-    ) -> None:
+    def __init__(self, base: System, law: Array, x: Array, u: Array, before: Array) -> None:
         self.base, self.law, self.x, self.u, self.before = base, law, x, u, before
         n, m = base.n, base.m
-        self.doubt = np.zeros((len(x), 0, n + m)) if doubt is None else doubt
-        self.priced = slice(2 * n + m, 2 * n + m + self.doubt.shape[1])
-        self.n, self.m, self.k, self.source = self.priced.stop, m, base.k, base.source
+        self.n, self.m, self.k, self.source = 2 * n + m, m, base.k, base.source
         self.inputs = base.inputs
         missed = (f"{name} mispredicted" for name in base.states)
-        doubts = (f"doubt {i}" for i in range(self.doubt.shape[1]))
-        self.states = (*base.states, *missed, *(f"input {i} before" for i in range(m)), *doubts)
+        self.states = (*base.states, *missed, *(f"input {i} before" for i in range(m)))
 
     def on(self, problem: Problem) -> Problem:
         """Return the base's grounded problem in this system."""
@@ -74,16 +60,13 @@ class Corrected(System):
         def padded(a: Array) -> Array:
             return np.concatenate([a, np.zeros((*a.shape[:-1], self.n - self.base.n))], axis=-1)
 
-        nothing, unsure = np.zeros(self.base.n), np.zeros(self.doubt.shape[1])
-        weight = padded(problem.state_weight)
-        weight[:, self.priced] = 1.0
         return replace(
             problem,
             system=self,
-            start=np.concatenate([problem.start, nothing, self.before[0], unsure]),
+            start=np.concatenate([problem.start, np.zeros(self.base.n), self.before[0]]),
             bias=padded(problem.bias),
             target=padded(problem.target),
-            state_weight=weight,
+            state_weight=padded(problem.state_weight),
             angles=np.append(problem.angles, np.zeros(self.n - self.base.n, bool)),
         )
 
@@ -91,8 +74,7 @@ class Corrected(System):
         """Convert the incumbent's trial, z (H + 1, nz) of the base, to this system's z."""
         n = self.base.n
         before = np.vstack([self.before, self.u[-1:]])
-        nothing, unsure = np.zeros((len(z), n)), np.zeros((len(z), self.doubt.shape[1]))
-        return np.hstack([z[:, :n], nothing, before, unsure, z[:, n:]])
+        return np.hstack([z[:, :n], np.zeros((len(z), n)), before, z[:, n:]])
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
         """See `System.step`; u is what the actuators received, without an input shift."""
@@ -115,7 +97,6 @@ class Corrected(System):
         F[:, :n], G[:, :n] = F[:, n : 2 * n], by_u + f_u
         F[:, :n, :n] += f_x
         G[:, 2 * n : 2 * n + m] = np.eye(m)
-        F[:, self.priced, :n], G[:, self.priced] = self.doubt[:, :, :n], self.doubt[:, :, n:]
         return F, G
 
     def sensitivities(
@@ -140,7 +121,7 @@ class Corrected(System):
 
         Args:
             problem: in this system.
-            x: states (N, 2 n + m + q).
+            x: states (N, 2 n + m).
             sent: received inputs (N, m), less the input shift.
             t: index of the step.
         """
@@ -150,15 +131,15 @@ class Corrected(System):
         return self._next(moved, x, sent + shift, t, problem.angles[: self.base.n])
 
     def _own(self, x: Array) -> Array:
-        """Return the base's states (N, n) of x (N, 2 n + m + q)."""
+        """Return the base's states (N, n) of x (N, 2 n + m)."""
         return np.ascontiguousarray(x[:, : self.base.n])
 
     def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
-        """Return the next [x, y, u before, e] (N, 2 n + m + q).
+        """Return the next [x, y, u before] (N, 2 n + m).
 
         Args:
             moved: the base's next states (N, n).
-            x: states (N, 2 n + m + q).
+            x: states (N, 2 n + m).
             u: inputs (N, m).
             t: index of the step, or all steps.
             angles: (n,) which states are angles.
@@ -168,10 +149,7 @@ class Corrected(System):
         before = x[:, 2 * n : 2 * n + m] - self.before[t]
         d = np.concatenate([away, u - self.u[t], before, x[:, n : 2 * n]], axis=1)
         y = np.einsum("...nq,...q->...n", self.law[t], d)
-        if not self.doubt.shape[1]:
-            return np.concatenate([moved + y, y, u], axis=1)
-        e = np.einsum("...pq,...q->...p", self.doubt[t], d[:, : n + m])
-        return np.concatenate([moved + y, y, u, e], axis=1)
+        return np.concatenate([moved + y, y, u], axis=1)
 
     def backward(
         self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
@@ -230,7 +208,7 @@ def _with_each_law(systems: Sequence[Corrected]) -> Corrected:
     if all(one is first for one in systems):
         return first
     law = np.stack([one.law for one in systems], axis=1)
-    return Corrected(first.base, law, first.x, first.u, first.before, first.doubt)
+    return Corrected(first.base, law, first.x, first.u, first.before)
 
 
 def _run(

@@ -107,8 +107,6 @@ class SearchOptions:
             bias; False for the paper's bias alone.
         max_halvings: smallest step size is alpha = 2^-max_halvings, 0 to 30.
         repeats: trials of each candidate, 1 to 100.
-        slopes_by_step: after two losses, also correct the derivatives of each step of the run by
-            themselves (`by_step`); False for laws of the whole run only.
         rerun_incumbent: run the best candidate again if a loss to it may be due to noise.
         max_trials: the search stops after this many trials.
         tolerance: the search ends when the model predicts a smaller relative gain, 0 to below 1.
@@ -121,7 +119,6 @@ class SearchOptions:
     step: Stepping = "damped"
     refit: bool = False
     match_inputs: bool = True
-    slopes_by_step: bool = True
     max_halvings: int = 6
     repeats: int = 1
     rerun_incumbent: bool = True
@@ -131,7 +128,7 @@ class SearchOptions:
     def __post_init__(self) -> None:
         for name, valid in (("method", METHODS), ("step", STEPS)):
             one_of(f"[search] {name}", getattr(self, name), valid)
-        for name in ("refit", "match_inputs", "slopes_by_step", "rerun_incumbent"):
+        for name in ("refit", "match_inputs", "rerun_incumbent"):
             if not isinstance(given := getattr(self, name), bool | np.bool_):
                 raise wrong(f"[search] {name}", given, must="bool")
         bounds = {"max_halvings": (0, 30), "repeats": (1, 100), "max_trials": (1, 100_000)}
@@ -175,7 +172,7 @@ class SearchOptions:
             enough = goes_on or len(losers_of(history, made.id, model)) >= OTHERS
             used_up = len(losers) >= OTHERS and not goes_on
             scatters = incumbent.standard_error > 0  # one way is enough to be told from luck
-            if scatters or used_up or not (self.damps and self.slopes_by_step and enough):
+            if scatters or used_up or not (self.damps and enough):
                 return None
         if slopes is not None:
             losers = [candidate for candidate in losers if candidate.slopes == slopes]

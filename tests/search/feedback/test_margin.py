@@ -5,7 +5,7 @@ import pytest
 
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.search.feedback.margin import worse_costs
+from grounded.search.feedback import worse_costs
 from grounded.search.improve import SearchOptions, propose
 from grounded.search.planner import Planner, planner_with, predicted
 from small_tasks import plain_task, speed_rover, speed_rover_task

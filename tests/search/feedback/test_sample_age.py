@@ -7,7 +7,7 @@ import pytest
 
 from grounded.policy import z_difference
 from grounded.rollout import for_late_samples, simulate
-from grounded.search.feedback.sample_age import sample_age
+from grounded.search.feedback import sample_age
 from grounded.search.improve import propose
 from grounded.search.step.step_size import SearchOptions
 from grounded.trial import Trial

@@ -38,7 +38,6 @@ if TYPE_CHECKING:
 ROWS = "rows_s"  # time between rows of a table that repeats commands
 INTERPOLATED = "interpolated_s"  # by which responses may begin early between samples
 ESTIMATED_WITH = "estimated_with"  # adopted effects of the model that estimated its speeds
-LASTED = "source_seconds"  # duration of the log
 READ_BY = "read_by"  # how [log] read its signals
 # a candidate's metadata, in the order of the file
 _FIELDS: Mapping[str, Callable[[str], Any]] = {

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.places import samples
-from grounded.search.feedback.oscillation import jumps
+from grounded.search.feedback import jumps
 from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded_trials.workspace.candidates.at_rest import held_before

@@ -31,7 +31,7 @@ from grounded.policy import Policy
 from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
 from grounded.search.difference import in_question
-from grounded.search.feedback.oscillation import limit_cycle
+from grounded.search.feedback import limit_cycle
 from grounded.search.safety import coasts_out, objections, spread
 from grounded.search.standing import Standing
 from grounded.task import Task

@@ -42,7 +42,6 @@ from grounded_trials.workspace.identity import refuse_ids, sha256
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
-    copied,
     read_own_trial,
 )
 from grounded_trials.workspace.intake.opening.stored_before import (
@@ -146,14 +145,13 @@ def ingest_log(
             from grounded_trials.workspace.intake.recognising.recognise import best_run_again
 
             read = best_run_again(workspace, path, error)
-    read = copied(workspace, path, read, "" if data else candidate)
     if not _as_logged(workspace, read):
         from grounded_trials.workspace.intake.recognising.recognise import recognised
 
         read = recognised(workspace, path, read, candidate)
     if read.log and read.log.stored:
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
-    before = "" if read.copy else repeated(workspace, path, read.trial, read.data)
+    before = repeated(workspace, path, read.trial, read.data)
     with ExitStack() as new:  # nothing is stored if judging the trial fails
         added = new.enter_context(workspace.store.adding(read.data, again=before != ""))
         if read.bare:  # record which candidate file it ran

@@ -33,7 +33,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
     INTERPOLATED,
-    LASTED,
     READ_BY,
     ROWS,
     StoredTrial,
@@ -302,8 +301,6 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
         kept = but_late_sensors(config.model.effects)
         source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in kept)
     series = mapped_signals(files, mapping, states, model.input_names)
-    ends = [(int(one.t.min()), int(one.t.max())) for one in series.values()]
-    source[LASTED] = f"{1e-9 * (max(e for _, e in ends) - min(b for b, _ in ends)):.6f}"
     return ForeignLog(workspace, path, mapping, estimate, series, source)
 
 

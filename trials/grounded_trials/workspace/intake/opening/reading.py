@@ -26,15 +26,12 @@ from grounded_trials.workspace.candidates.search_state import none_waits, standi
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
-    LASTED,
     READ_BY,
     other_task,
     sha256,
 )
 from grounded_trials.workspace.intake.opening.stored_before import (
     Aside,
-    refuse_as_another,
-    same_recording,
 )
 
 if TYPE_CHECKING:
@@ -51,7 +48,6 @@ class Read:
     data: bytes
     findings: tuple[Finding, ...] = ()
     signals: tuple[SignalReport, ...] = ()
-    copy: bool = False  # a copy of a stored trial, or of a part of one
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
     before: Aside | None = None  # the trial that was made from the log before and is set aside
@@ -66,7 +62,7 @@ class Read:
     @property
     def own(self) -> bool:
         """Whether it was written by grounded, in the model's units, and not read through [log]."""
-        return self.log is None and not self.copy
+        return self.log is None
 
     @property
     def to_set_aside(self) -> Finding | None:
@@ -103,7 +99,7 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
     if data:
         if not trial.candidate:
             return Read(trial, content)
-        kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, LASTED, READ_BY)
+        kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, READ_BY)
         kept_of = {k: v for k, v in meta.items() if k in kept}
         kept_of |= {"kind": "data", "ran": trial.candidate}
         some = _elsewhere(workspace, trial.candidate, policy)
@@ -191,17 +187,6 @@ def encode(workspace: Folder, trial: Trial, facts: dict[str, str], start_ns: int
         input_units=dict(workspace.base_model.inputs),
         start_ns=start_ns,
     )
-
-
-def copied(workspace: Folder, path: Path, read: Read, wanted: str | None) -> Read:
-    """Replace a file that is a copy or a part of a stored trial by that trial."""
-    if is_stored(workspace, read.data) or (read.log and read.log.stored):
-        return read
-    if (one := same_recording(workspace, path, read.data, read.log)) is None:
-        return read
-    refuse_as_another(workspace, path, (one,), wanted)
-    same = found("log.repeats", one.stored.id, weight=Weight.NOTE)
-    return Read(one.trial, workspace.store.read(one.stored), (same,), copy=True)
 
 
 def is_stored(workspace: Folder, data: bytes) -> bool:

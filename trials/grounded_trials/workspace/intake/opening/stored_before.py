@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,18 +20,14 @@ from grounded.findings import Finding, found
 from grounded.search.standing import Phase
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files, on_disk
-from grounded_trials.logs.resample import ABSOLUTE_S
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import ESTIMATED_WITH, LASTED, StoredTrial, sha256
+from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
-
-EDGE = 2  # last rows of a cut log that are ignored, since its end affects them
-SHARED_ROWS = 10  # rows that two recordings must share to count as the same
 
 
 def refuse_as_another(
@@ -122,85 +118,6 @@ def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> 
     if not names:
         return data  # another part of a long recording
     raise refused("log.stored", log.path, trial=names, other=1, then=NextCommand("discard", names))
-
-
-def same_recording(
-    workspace: Folder, path: Path, data: bytes, log: ForeignLog | None
-) -> StoredTrial | None:
-    """Return the stored trial that a file is a copy or a part of (recovered from damage, say).
-
-    Trials are the same recording if all rows are equal at the same times of the log's clock.
-    Complete runs of a deterministic simulator whose clock starts at zero are not: they may be equal
-    in logs of equal length.
-
-    Args:
-        workspace: the workspace.
-        path: the file.
-        data: the trial in it, as it would be stored.
-        log: the log from which the trial was read; None if the file was written by grounded.
-
-    Raises:
-        GroundedError: if it has more of the recording than the stored trial, or other numbers.
-    """
-    stored = workspace.whole_trials()
-    if not stored:
-        return None
-    trial, meta, _ = read_trial(data)
-    begin, end = _span(meta, trial)
-    for one in stored:
-        first, last = _span(one.meta, one.measured)
-        foreign = "source" in one.meta
-        if foreign != (log is not None) or not (first < end and begin < last):
-            continue
-        here = trial
-        if one.meta["start_ns"] != meta["start_ns"]:
-            if log is None or (there := _from(log, one)) is None:
-                continue
-            here = there
-        alike = _alike(one, here)
-        stamped = first > ABSOLUTE_S  # absolute time; else the clock of each log may start at zero
-        if alike == "none" or (alike == "some" and not stamped):
-            continue
-        identity, more = one.stored.id, here.finite_steps > one.measured.finite_steps
-        if alike == "some" or more:
-            how = {"other": 1} if alike == "some" else {"part": 1}
-            then = NextCommand("discard", (identity,))
-            raise refused("log.stored", path, trial=identity, then=then, **how)
-        lasted = one.meta.get(LASTED)
-        cut = lasted is not None and log is not None and lasted != log.source[LASTED]
-        if stamped or cut or here.finite_steps < one.measured.finite_steps:
-            return one
-    return None
-
-
-def _from(log: ForeignLog, one: StoredTrial) -> Trial | None:
-    """Return a log as a trial that begins when a stored one does, or None if it can't be cut."""
-    with suppress(GroundedError):
-        _, found = log.cut("")
-        after = 1e-9 * (int(one.meta["start_ns"]) - found.origin_ns)
-        return log.cut(one.trial.candidate or "", after)[0]
-    return None
-
-
-def _alike(one: StoredTrial, here: Trial) -> Literal["all", "some", "none"]:
-    """Return which signals are equal row by row: all, some (the inputs and some states), or none.
-
-    "some" means that the recording was read in another way. Constant and estimated signals are
-    ignored.
-    """
-    before = one.measured
-    names = (before.state_names, before.input_names)
-    rows = min(before.finite_steps, here.finite_steps) - EDGE
-    if rows < SHARED_ROWS or names != (here.state_names, here.input_names):
-        return "none"
-    guessed = one.meta.get("estimated", "").split(",")
-    known = [i for i, name in enumerate(here.state_names) if name not in guessed]
-    states, inputs = before.states[:rows, known], before.inputs[:rows]
-    same = (states == here.states[:rows, known]).all(axis=0)
-    telling = np.ptp(states, axis=0) > 0
-    if not np.array_equal(inputs, here.inputs[:rows]) or not (same & telling).any():
-        return "none"
-    return "all" if same.all() else "some"
 
 
 def _span(meta: Mapping[str, str], trial: Trial) -> tuple[float, float]:
