@@ -4,13 +4,14 @@ Search proposes, this rule claims. Every set of causes that was fitted is an `Op
 and its errors where its values were not fitted (`ruler`, by group of trials). The rule has four
 steps:
 
-    1. A set is *supported* if each of its causes is: with it the set is likelier (PICKED nats), and
-       predictions are better by more than their standard error and as much as matters (LEAST, and
-       SHARE of what the set gains). A cause that a guard refuses is not supported.
+    1. A set is *supported* if it is better than without any one of its causes. *Better* is a set
+       that is likelier (PICKED nats) and whose predictions are better by more than their standard
+       error and as much as matters (LEAST, and SHARE of what the set gains). A cause that a guard
+       refuses is not supported.
     2. The *reference* is the supported set that predicts best.
-    3. Of the supported sets that the reference predicts no better than, by the same test of
-       predictions, the smallest is chosen: the one-standard-error rule of Breiman et al. (1984),
-       and of projection predictive selection (Piironen & Vehtari 2017).
+    3. Of the supported sets that the reference is not better than, the smallest is chosen: the
+       one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
+       (Piironen & Vehtari 2017).
     4. Of those that are as small, the likeliest. Within NATS nats they tie: then a parameter comes
        before a mechanism, and that before what has no mechanism (`Option.order`).
 
@@ -101,7 +102,7 @@ class Rule:
             return Choice(likeliest, likeliest, 0.0, 0.0)
         by = sorted(self.options, key=self.gained, reverse=True)
         reference = next(option for option in by if not self.unsupported(option))
-        near = [o for o in by if not self.gain(o.errors, reference.errors).pays]
+        near = [option for option in by if not self.better(option, reference)]
         for size in sorted({len(option.causes) for option in near}):
             small = [o for o in near if len(o.causes) == size and not self.unsupported(o)]
             if small:
@@ -128,14 +129,17 @@ class Rule:
         """Take some causes of a set for unsupported from now on."""
         self._unsupported[option.causes] = causes
 
-    def _needed(self, option: Option, cause: str) -> bool:
-        """Check whether a set is likelier and predicts better with one of its causes."""
-        less = self.less(option, cause)
-        if less is None or not option.evidence - less.evidence >= PICKED:  # also of no evidence
+    def better(self, before: Option, after: Option) -> bool:
+        """Check whether one set is likelier than another and predicts better."""
+        if not after.evidence - before.evidence >= PICKED:  # also of no evidence
             return False
-        more = self.gain(less.errors, option.errors)
-        matters = more.mean >= SHARE * max(self.gained(option), 0.0)
-        return not self.held_out or (matters and more.pays)
+        gain = self.gain(before.errors, after.errors)
+        matters = gain.mean >= SHARE * max(self.gained(after), 0.0)
+        return not self.held_out or (matters and gain.pays)
+
+    def _needed(self, option: Option, cause: str) -> bool:
+        less = self.less(option, cause)
+        return less is not None and self.better(less, option)
 
 
 @dataclass(frozen=True, eq=False)
