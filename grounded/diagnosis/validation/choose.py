@@ -5,9 +5,9 @@ and its errors where its values were not fitted (`ruler`, by group of trials). T
 steps:
 
     1. A set is *supported* if it is better than without any one of its causes. *Better* is a set
-       that is likelier (PICKED nats) and whose predictions are better by more than their standard
-       error and as much as matters (LEAST, and SHARE of what the set gains). A cause that a guard
-       refuses is not supported.
+       whose predictions are better by more than their standard error and as much as matters
+       (LEAST, and SHARE of what the set gains) and, if it is larger, that is likelier (PICKED
+       nats). A cause that a guard refuses is not supported.
     2. The *reference* is the supported set that predicts best.
     3. Of the supported sets that the reference is not better than, the smallest is chosen: the
        one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
@@ -130,8 +130,9 @@ class Rule:
         self._unsupported[option.causes] = causes
 
     def better(self, before: Option, after: Option) -> bool:
-        """Check whether one set is likelier than another and predicts better."""
-        if not after.evidence - before.evidence >= PICKED:  # also of no evidence
+        """Check whether one set predicts better than another and, if it is larger, is likelier."""
+        larger, nats = len(after.causes) > len(before.causes), after.evidence - before.evidence
+        if larger and not nats >= PICKED:  # also of no evidence
             return False
         gain = self.gain(before.errors, after.errors)
         matters = gain.mean >= SHARE * max(self.gained(after), 0.0)
