@@ -5,9 +5,9 @@ and its errors where its values were not fitted (`ruler`, by group of trials). T
 steps:
 
     1. A set is *supported* if it is better than without any one of its causes. *Better* is a set
-       whose predictions are better by more than their standard error and as much as matters
-       (LEAST, and SHARE of what the set gains) and, if it is larger, that is likelier (PICKED
-       nats). A cause that a guard refuses is not supported.
+       whose predictions are better by more than their standard error and, if it is larger, that
+       is likelier (PICKED nats). A cause that a guard refuses is not supported, nor one that gains
+       less than matters (LEAST, and SHARE of what the set gains).
     2. The *reference* is the supported set that predicts best.
     3. Of the supported sets that the reference is not better than, the smallest is chosen: the
        one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
@@ -38,6 +38,7 @@ from typing import Any
 
 import numpy as np
 
+from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.levels import ERRORS, LEAST, NATS, PICKED, SHARE, SURE
 from grounded.frozen import Array
 
@@ -57,6 +58,11 @@ class Option:
     evidence: float
     errors: Errors
     order: int = 0
+
+    @property
+    def size(self) -> int:
+        """Number of its causes, of which calibration, of several parameters, counts as two."""
+        return len(self.causes) + (CALIBRATION in self.causes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,16 +137,17 @@ class Rule:
 
     def better(self, before: Option, after: Option) -> bool:
         """Check whether one set predicts better than another and, if it is larger, is likelier."""
-        larger, nats = len(after.causes) > len(before.causes), after.evidence - before.evidence
+        larger, nats = after.size > before.size, after.evidence - before.evidence
         if larger and not nats >= PICKED:  # also of no evidence
             return False
-        gain = self.gain(before.errors, after.errors)
-        matters = gain.mean >= SHARE * max(self.gained(after), 0.0)
-        return not self.held_out or (matters and gain.pays)
+        return not self.held_out or self.gain(before.errors, after.errors).pays
 
     def _needed(self, option: Option, cause: str) -> bool:
         less = self.less(option, cause)
-        return less is not None and self.better(less, option)
+        if less is None or not self.better(less, option):
+            return False
+        more = self.gain(less.errors, option.errors).mean
+        return not self.held_out or more >= SHARE * max(self.gained(option), 0.0)
 
 
 @dataclass(frozen=True, eq=False)
