@@ -46,18 +46,24 @@ def fitted(case):
         diagnosing.decide = decide
     options = Options(kept["search"], kept["ruler"])
     known = {one.causes: one for one in options.hopeful()}
-    less = {}
-    for one in list(known.values()):
-        for cause in one.causes:
-            if (rest := options.less(one, cause)) is not None:
-                less[one.causes, cause] = rest
+    less = {
+        (one.causes, cause): rest
+        for one in known.values()
+        for cause in one.causes
+        if (rest := options.less(one, cause)) is not None
+    }
+    pairs = [(rest, known[own]) for (own, _), rest in less.items()]
+    pairs += [(a, b) for a in known.values() for b in known.values() if a.size < b.size]
+    nats = {(a.causes, b.causes): options.nats(a, b) for a, b in pairs}
+    none = known[frozenset()]
+    alone = {one.causes: options.nats(none, one) for one in [*known.values(), *less.values()]}
     label = of_crude(case.label, case.model)
     true = oracle(case.model, case.trials, case.latency, label)
     ruler = kept["ruler"]
     return {
-        "options": list(known.values()), "less": less, "compare": ruler.comparison, "label": label,
-        "oracle": true, "document": document, "marks": judge(label, document, true),
-        "held_out": ruler.held_out,
+        "options": list(known.values()), "less": less, "nats": nats, "alone": alone,
+        "compare": ruler.comparison, "held_out": ruler.held_out, "label": label, "oracle": true,
+        "document": document, "marks": judge(label, document, true),
     }  # fmt: skip
 
 
@@ -74,7 +80,11 @@ def decided(case):
     def less(option, cause):
         return case["less"].get((option.causes, cause))
 
-    rule = choose.Rule(case["options"], gain, less, held_out=case["held_out"])
+    def nats(before, after):
+        apart = case["alone"][after.causes] - case["alone"][before.causes]
+        return case["nats"].get((before.causes, after.causes), apart)
+
+    rule = choose.Rule(case["options"], gain, nats, less, held_out=case["held_out"])
     return rule.choose().chosen.causes - {"calibration"}
 
 

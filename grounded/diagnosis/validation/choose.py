@@ -1,8 +1,7 @@
 """The rule that decides what is claimed: the smallest set of causes that predicts as well as any.
 
-Search proposes, this rule claims. Every set of causes that was fitted is an `Option`: its evidence,
-and its errors where its values were not fitted (`ruler`, by group of trials). The rule has four
-steps:
+Search proposes, this rule claims. Every set of causes that was fitted is an `Option`: its errors
+where its values were not fitted (`ruler`, by group of trials). The rule has four steps:
 
     1. A set is *supported* if it is better than without any one of its causes. *Better* is a set
        whose predictions are better by more than their standard error and, if it is larger, that
@@ -49,13 +48,11 @@ class Option:
 
     Args:
         causes: names of its effects, and "calibration" if the parameters are free.
-        evidence: log evidence, priced and tempered [nats].
         errors: held-out errors.
         order: of its causes: 0 a parameter, 1 a mechanism, 2 without a mechanism, summed up.
     """
 
     causes: frozenset[str]
-    evidence: float
     errors: Errors
     order: int = 0
 
@@ -81,6 +78,7 @@ class Rule:
     Args:
         options: the fitted sets, of each at most one, with the set without any cause.
         gain: compares the errors of two options.
+        nats: returns how much likelier a second option is, priced and tempered [nats].
         less: returns a set without one cause, fitted if it was not; None if it can't be, or if a
             guard refuses the cause.
         held_out: False if nothing could be held out; then evidence alone decides.
@@ -91,19 +89,22 @@ class Rule:
         self,
         options: Sequence[Option],
         gain: Callable[[Errors, Errors], Gain],
+        nats: Callable[[Option, Option], float],
         less: Callable[[Option, str], Option | None],
         *,
         held_out: bool = True,
         outset: Errors | None = None,
     ) -> None:
-        self.options, self.gain, self.less, self.held_out = list(options), gain, less, held_out
+        self.options, self.gain, self.nats, self.less = list(options), gain, nats, less
+        self.held_out = held_out
         self.outset = outset or next(o.errors for o in options if not o.causes)
         self._unsupported: dict[frozenset[str], list[str]] = {}
 
     def choose(self) -> Choice:
         """Return the smallest supported set that predicts as well as the best one."""
+        none = next(option for option in self.options if not option.causes)
         if not self.held_out:
-            by = sorted(self.options, key=lambda option: -option.evidence)
+            by = sorted(self.options, key=lambda option: -self.nats(none, option))
             likeliest = next(option for option in by if not self.unsupported(option))
             return Choice(likeliest, likeliest, 0.0, 0.0)
         by = sorted(self.options, key=self.gained, reverse=True)
@@ -113,9 +114,9 @@ class Rule:
             small = [o for o in near if len(o.causes) == size and not self.unsupported(o)]
             if small:
                 break
-        most = max(option.evidence for option in small)
-        tied = [option for option in small if option.evidence > most - NATS]
-        chosen = min(tied, key=lambda option: (option.order, -option.evidence))
+        nats = {option.causes: self.nats(none, option) for option in small}
+        tied = [option for option in small if nats[option.causes] > max(nats.values()) - NATS]
+        chosen = min(tied, key=lambda option: (option.order, -nats[option.causes]))
         apart = self.gain(chosen.errors, reference.errors)
         return Choice(chosen, reference, apart.mean, apart.paired[1])
 
@@ -137,8 +138,7 @@ class Rule:
 
     def better(self, before: Option, after: Option) -> bool:
         """Check whether one set predicts better than another and, if it is larger, is likelier."""
-        larger, nats = after.size > before.size, after.evidence - before.evidence
-        if larger and not nats >= PICKED:  # also of no evidence
+        if after.size > before.size and not self.nats(before, after) >= PICKED:  # also of none
             return False
         return not self.held_out or self.gain(before.errors, after.errors).pays
 

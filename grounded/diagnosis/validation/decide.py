@@ -104,7 +104,14 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
     ruler.beside(search.exact_null())
     options = Options(search, ruler)
     hopeful, outset = options.hopeful(), ruler.outset
-    rule = Rule(hopeful, ruler.compared, options.less, held_out=ruler.held_out, outset=outset)
+    rule = Rule(
+        hopeful,
+        ruler.compared,
+        options.nats,
+        options.less,
+        held_out=ruler.held_out,
+        outset=outset,
+    )
     choice = rule.choose()
     while vague := options.vague(choice.chosen):
         rule.refuse(choice.chosen, vague)
@@ -121,7 +128,7 @@ def decide(search: HypothesisSearch, ruler: Ruler) -> Decision:
         fit,
         search.latest(crude),
         less,
-        {c: choice.chosen.evidence - one.evidence for c, one in rest.items()},
+        {c: options.nats(one, choice.chosen) for c, one in rest.items()},
         choice,
         _doubtful(options, rule, choice),
         tuple(left),
@@ -204,13 +211,12 @@ class Options:
     def option(self, own: frozenset[str]) -> Option:
         """Return a set of causes as an option."""
         if own not in self._known:
-            fit, likeliest = self.fits[own], self._of(own)[0]
+            fit = self.fits[own]
             order = sum(
                 0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
                 for e in fit.hypothesis.effects
             )
-            evidence = self.search.score(likeliest)
-            self._known[own] = Option(own, evidence, self.ruler.errors(fit), order)
+            self._known[own] = Option(own, self.ruler.errors(fit), order)
         return self._known[own]
 
     def vague_alone(self, own: frozenset[str]) -> list[str]:
@@ -233,26 +239,31 @@ class Options:
     def less(self, option: Option, cause: str) -> Option | None:
         """Return a set without one cause, fitted from the values and the noise of the larger one.
 
-        Otherwise the cause would be credited with what better values of the others gain. Evidence
-        is that of the likeliest noise, as a cause gets no credit for what the rest can do under
-        another one; so the larger set is fitted under that, too. None if the rest can't be
-        filtered, or if a guard refuses the cause.
+        Otherwise the cause would be credited with what better values of the others gain. None if
+        the rest can't be filtered, or if a guard refuses the cause.
         """
         fit, search = self.fits[option.causes], self.search
         own = self._fitted_without(option.causes, cause)
         if own is None or cause in self.vague_alone(option.causes):
             return None
-        less = self.fits[own]
-        cut = cause != CALIBRATION and not {*stopped(search, fit)} <= {*stopped(search, less)}
-        loose = cause != CALIBRATION and one_group(search, fit, cause)
-        if cut or loose:
+        cut = {*stopped(search, fit)} - {*stopped(search, self.fits[own])}
+        if cause != CALIBRATION and (cut or one_group(search, fit, cause)):
             return None
-        likeliest = self._of(own)[0]
-        structures = {f.noise.structure for f in self._of(option.causes)}
-        if likeliest.noise.structure not in structures:
-            search.refined([(fit.hypothesis, likeliest.noise, fit.track)], REFIT)
-        nats = search.score(self._of(option.causes)[0]) - search.score(likeliest)
-        return replace(self.option(own), evidence=option.evidence - nats)
+        return self.option(own)
+
+    def nats(self, before: Option, after: Option) -> float:
+        """Return how much likelier a second set is, under the likeliest noise of either [nats].
+
+        A cause gets no credit for what the rest can do under another noise. So the second set is
+        fitted under that of the first, too.
+        """
+        likeliest, known = self._of(before.causes)[0], self._of(after.causes)
+        structure = likeliest.noise.structure
+        if structure not in {fit.noise.structure for fit in known}:
+            fit = self.fits[after.causes]
+            self.search.refined([(fit.hypothesis, likeliest.noise, fit.track)], REFIT)
+            known = self._of(after.causes)
+        return self.search.score(known[0]) - self.search.score(likeliest)
 
 
 def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
@@ -288,10 +299,10 @@ def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> tuple[int, ..
 def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, ...]:
     """Return the effects that are likely beside the choice but in one group, likeliest first."""
     found, own, search = list[Doubtful](), choice.chosen.causes, options.search
-    for option in rule.options if rule.held_out else ():
-        nats = option.evidence - choice.chosen.evidence
-        if own < option.causes and len(option.causes) == len(own) + 1 and nats > NATS:
-            (name,) = option.causes - own
+    larger = [o for o in rule.options if own < o.causes and len(o.causes) == len(own) + 1]
+    for option in larger if rule.held_out else ():
+        nats, (name,) = options.nats(choice.chosen, option), option.causes - own
+        if nats > NATS:
             fit = options.fits[option.causes]
             sized = name in equations(fit) and name not in options.vague_alone(option.causes)
             if sized and (alone := one_group(search, fit, name)):

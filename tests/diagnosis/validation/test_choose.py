@@ -7,6 +7,7 @@ from grounded.diagnosis.validation.choose import Comparison, Errors, Option, Rul
 
 TRIALS = 6
 COMPARE = Comparison([0], np.full((2, 1), 1e-6), np.arange(TRIALS))
+NATS = {}  # evidence by option
 
 
 def option(causes, nats, rms, order=0, scatter=0.0):
@@ -14,7 +15,9 @@ def option(causes, nats, rms, order=0, scatter=0.0):
     apart = 1 + scatter * np.cos(np.arange(TRIALS) * 2.5)
     total = np.tile((np.array(rms) * apart) ** 2, (2, 1))[..., None]
     errors = Errors(total, np.ones_like(total))
-    return Option(frozenset(causes.split()), nats, errors, order)
+    made = Option(frozenset(causes.split()), errors, order)
+    NATS[made] = nats
+    return made
 
 
 def chosen(*options, held_out=True):
@@ -23,7 +26,10 @@ def chosen(*options, held_out=True):
     def less(one, cause):
         return known.get(one.causes - {cause})
 
-    return Rule(options, COMPARE, less, held_out=held_out).choose()
+    def nats(before, after):
+        return NATS[after] - NATS[before]
+
+    return Rule(options, COMPARE, nats, less, held_out=held_out).choose()
 
 
 NONE = option("", 0.0, 1.0)
@@ -44,6 +50,8 @@ DRAG, BIAS = option("drag", 80.0, 0.3), option("bias", 30.0, 0.8)
         ([NONE, DRAG, option("bias drag", 110.0, 0.1)], "drag"),  # the rest was never fitted
         ([NONE, DRAG, option("lag", 85.0, 0.301)], "lag"),  # as small and as good: the likelier
         ([NONE, DRAG, option("lag", 85.0, 0.5)], "drag"),  # likelier, and predicts worse
+        ([NONE, DRAG, option("calibration", 70.0, 0.2)], "drag"),  # of several parameters
+        ([NONE, DRAG, option("calibration", 90.0, 0.2)], "calibration"),
         ([NONE, option("drag", 80.0, 0.3, order=1), option("mass", 78.0, 0.3)], "mass"),
         ([NONE, option("wave", 80.0, 0.3, order=2), option("drag", 78.0, 0.3, order=1)], "drag"),
         ([NONE, option("wave", 90.0, 0.3, order=2), option("drag", 78.0, 0.3, order=1)], "wave"),
