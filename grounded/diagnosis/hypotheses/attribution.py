@@ -10,7 +10,6 @@ better. Confirmation on held-out trials follows later (`validation`).
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from grounded.diagnosis.hypotheses.joint_model import joint_model
 from grounded.diagnosis.hypotheses.search import (
     LARGE_GAIN,
     SHORTLIST,
-    SPREADS,
     STATES_LARGE,
     TO_THE_TOP,
     HypothesisSearch,
@@ -37,15 +35,12 @@ from grounded.diagnosis.likelihood.data import Data, fewer
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
-from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import Effect
 from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # most effects searched for at first
 AT_FIRST = 8  # iterations of the first fit of a further effect
-HALVES = 2  # single effects that are also extended though other hypotheses are likelier
-ALONE_ITERATIONS = 12  # iterations of fits of the model alone from each other's values
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
 RESTARTED = 3  # large effects that are also fitted from a start of their own
 
@@ -177,60 +172,20 @@ def outliers(fit: Fitted) -> bool:
 def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
     """Return the fits to extend by one effect.
 
-    These are the likeliest; the same under white noise with exact parameters, because coloured
-    noise or parameters may have absorbed the further effect; and one that predicts clearly better,
-    which may become the likeliest with it.
+    These are a set that was chosen, the likeliest, and the same under white noise with exact
+    parameters, because coloured noise or parameters may have absorbed the further effect.
     """
     likely = [
         f
         for f in search.of_size(size)[: 3 if size == 1 else 1]
         if search.score(f) > search.score(best) - 25
     ]
-    found = list(likely)
+    found = [best, *(f for f in likely if f is not best)]
     for fit in likely[:2]:
         plain = search.fits.get((Structure(), 0.0, tuple(sorted(fit.hypothesis.names))))
-        if plain is not None and plain is not fit:
+        if plain is not None and plain not in found:
             found.append(plain)
-    foretold = _foretold(search, size, best)
-    return found if foretold in found else [*found, foretold]
-
-
-def _foretold(search: HypothesisSearch, size: int, best: Fitted) -> Fitted:
-    """Return which of the likely sets predicts held-out trials best.
-
-    Far above the noise, evidence favours effects that act often. For example, a friction that grows
-    with the load may predict a second ahead much better than a constant one that is hundreds of
-    nats likelier step by step.
-    """
-    ruler, floor = Ruler(search.predictor), search.score(search.best_null()) + LARGE_GAIN
-    rivals = [fit for fit in search.of_size(size)[:HOPEFUL] if search.score(fit) > floor]
-    if not rivals or not ruler.held_out:
-        return best
-    ruler.beside(search.exact_null())
-    found = best
-    for fit in rivals:
-        if fit is not best and ruler.gain(found, fit).clear:
-            found = fit
     return found
-
-
-def _halves(search: HypothesisSearch, starts: Sequence[Fitted]) -> list[Fitted]:
-    """Return the likeliest single effects under white noise and exact parameters, not yet extended.
-
-    Two effects together may be mistaken for a third with more parameters, such as a bias and a
-    trend for a slow wave. Effects less likely than calibration alone are left out, since two
-    effects can imitate two wrong parameters.
-    """
-    null, score = search.fits.get((Structure(), 0.0, ())), search.score
-    plain = [
-        fit
-        for (structure, spread, names), fit in search.fits.items()
-        if len(names) == 1 and structure == Structure() and not spread
-    ]
-    likely = sorted(plain, key=lambda fit: -score(fit))[:HALVES]
-    if null is None:
-        return []
-    return [f for f in likely if f not in starts and score(f) > score(null) + LARGE_GAIN]
 
 
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
@@ -244,9 +199,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         best = varied(search, best)
         starts = _starts(search, size, best)
         done |= {frozenset(fit.hypothesis.names) for fit in starts}
-        halves = _halves(search, starts) if size == 1 else []
         added = [search.extended(start, AT_FIRST) for start in starts]
-        added += [search.extended(half, 4) for half in halves]
         firsts = [max(fits, key=search.score) for fits in added if fits]  # noise differs between
         search.refined(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
@@ -318,7 +271,6 @@ def settle(search: HypothesisSearch, most: int) -> None:
     computation. Without effects, noise and parameters explain the gap in several ways, each a
     maximum of its own: every likely fit is tried from the best of these.
     """
-    _neighbours(search)
     for _ in range(ROUNDS):
         near, claimed = list[Fitted](), len(search.chosen(most).hypothesis.names)
         for size in range(most + 1):
@@ -329,24 +281,3 @@ def settle(search: HypothesisSearch, most: int) -> None:
         if not near:
             return
         search.settled(near)
-
-
-def _neighbours(search: HypothesisSearch) -> None:
-    """Fit the model alone under other noise and other priors, each from the likeliest such fit.
-
-    First the likeliest is fitted from the noise and parameters of several effects, as `fair` does
-    from those of one.
-    """
-    found = max(search.fits.values(), key=search.score)
-    if len(found.hypothesis.effects) > 1:
-        bare = replace(found.hypothesis, effects=(), values=())
-        search.refined([(bare, found.noise, found.track)], ALONE_ITERATIONS)
-    for _ in range(ROUNDS):
-        best = search.best_null()
-        h = best.hypothesis
-        near = [(replace(h, spread=w), best.noise, best.track) for w in SPREADS if h.spread > 0]
-        search.refined([start for start in near if start[0].spread != h.spread], ALONE_ITERATIONS)
-        search.coloured(h, best.noise, best.track, iterations=ALONE_ITERATIONS)
-        if search.best_null() is best:
-            return
-        search.refined([search.best_null()], TO_THE_TOP)

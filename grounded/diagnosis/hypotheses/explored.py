@@ -60,7 +60,7 @@ class FittedHypotheses:
         key = (effect.name, len(effect.free), *sorted(values.items()))
         if key not in self._prices:
             targets = self.crowd.get(effect.name, 1)
-            self._prices[key] = price(self.predictor, effect, values, targets)
+            self._prices[key] = price(self.data, effect, values, targets)
         return self._prices[key]
 
     def score(self, fit: Fitted) -> float:
@@ -185,16 +185,13 @@ BRIEF = 0.1  # of a control step: shorter delays and lags may be errors of the t
 LEFT = 0.25  # effects cancel if together they do less than this fraction of what each does alone
 WINDOW, OFTEN, TOO_SLOW = 0.25, 0.9, 0.5  # [s], quantile of changes, share of it: see _seen_rate
 NOISE_CHANGES = 1.645  # the same quantile of |x| of a standard normal x
-SAME = 0.05  # a dead zone is a mere offset if they differ by less than this part of its power
 
 
-def price(
-    predictor: Predictor, effect: Effect, values: Mapping[str, float], targets: int = 1
-) -> float:
+def price(data: Data, effect: Effect, values: Mapping[str, float], targets: int = 1) -> float:
     """Return the price of an effect, subtracted from its gain in log-likelihood [nats].
 
     Args:
-        predictor: evaluates hypotheses on the data.
+        data: the trials, of which steps and dt count.
         effect: the effect.
         values: its values, which the price may depend on.
         targets: the number of targets at which its family could have been blamed.
@@ -202,7 +199,6 @@ def price(
     Returns:
         The price; infinite for a value that can't be claimed.
     """
-    data = predictor.data
     if isinstance(effect.family, ParamFamily):
         return math.log(targets) + _of_parameter(effect, values, data.steps)
     if effect.known:
@@ -216,9 +212,7 @@ def price(
     numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
     cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
     cost += _of_less_friction(effect, values)
-    if not _mere_offset(predictor, effect, values):
-        cost += math.log(effect.places)
-    return cost + math.log(targets)
+    return cost + math.log(effect.places) + math.log(targets)
 
 
 def _seen_rate(data: Data, effect: Effect) -> float:
@@ -322,26 +316,3 @@ def _of_change(effect: Effect, values: Mapping[str, float], steps: int) -> float
     sizes = {q.name: ADOPTED_SPREAD * q.known for q in effect.free if q.known}
     pulls = sum(0.5 * (values.get(name, 0.0) / size) ** 2 for name, size in sizes.items())
     return pulls + 0.25 * len(effect.free) * math.log(max(steps, 2)) + 1.0
-
-
-def _mere_offset(predictor: Predictor, effect: Effect, values: Mapping[str, float]) -> bool:
-    """Check whether a dead zone acts as a constant offset, because the input never rests in it.
-
-    Then all thresholds of the grid have the same effect, and the search costs nothing.
-    """
-    if effect.family.name != "dead_zone" or "c" not in values:
-        return False
-    data, x = predictor.data, predictor.data.y[:-1]
-    model, j = data.model, data.model.input_names.index(effect.site.target)
-    zone = predictor.inputs(Hypothesis().plus(effect, values))
-    plain = predictor.inputs(Hypothesis())
-    offset = plain.copy()
-    offset[..., j] -= values["c"] * np.sign(plain[..., j].mean())
-    p = predictor.params(Hypothesis())
-    acts, missed = 0.0, 0.0
-    after = predictor.step(x, zone, p)
-    for other in (plain, offset):
-        moved = model.difference(predictor.step(x, other, p), after)
-        size = float((moved**2 * data.valid.T[..., None]).sum())
-        acts, missed = (size, missed) if other is plain else (acts, size)
-    return missed <= SAME * acts
