@@ -53,7 +53,6 @@ def fitted(case):
         if (rest := options.less(one, cause)) is not None
     }
     pairs = [(rest, known[own]) for (own, _), rest in less.items()]
-    pairs += [(a, b) for a in known.values() for b in known.values() if a.size < b.size]
     nats = {(a.causes, b.causes): options.nats(a, b) for a, b in pairs}
     none = known[frozenset()]
     alone = {one.causes: options.nats(none, one) for one in [*known.values(), *less.values()]}
