@@ -14,8 +14,6 @@ from grounded.result import Document, with_unit
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Agreement
 
-AT_MOST = "repeats, at most"  # source of a noise floor that holds errors of the model as well
-BOUNDS = ("alike", AT_MOST)  # sources of an upper bound
 CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
 # families of what arrives late, and the quantity that is a time [s]
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
@@ -108,10 +106,11 @@ class RulerRow(Document):
     held_out: by "trials", by "pieces" of one long log, or "no" if there are too few data.
     outset: errors of the model before anything was adopted; empty if nothing was.
     calibrated: errors with the model's own parameters fitted; empty if all are constants.
-    floor_from: "repeats" of a candidate, "repeats, at most" beside a leftover, trials whose
-        commands are "alike", or the "short horizon", whose noise is propagated by the model.
-    floor_at_most: `noise_floor` is an upper bound and the noise may be far less. No trial was
-        repeated and the innovations are not white, so part of them is the model's error.
+    floor_from: "repeats" of a manoeuvre, or the "short horizon", whose noise is propagated by the
+        model.
+    floor_at_most: `noise_floor` is an upper bound and the noise may be far less: beside a leftover
+        repeats scatter by what the model misses in each of them, too. Without repeats, part of the
+        innovations is the model's error if they are not white.
     runs_away: by column ("crude" ...), the channels whose prediction diverges far beyond the
         measured range, as in open loop for an unstable plant. Its error is meaningless.
     floor_unsure: standard deviation of the logarithm of a floor from few or short repeats.
@@ -133,16 +132,6 @@ class RulerRow(Document):
     outset: Mapping[str, float] = field(metadata=BRIEF, default_factory=dict)
     runs_away: Mapping[str, tuple[str, ...]] = field(metadata=BRIEF, default_factory=dict)
     drowned: bool = field(metadata=BRIEF, default=False)
-
-    @property
-    def floor_bound(self) -> bool:
-        """Whether the noise is at most `noise_floor`.
-
-        The scatter of trials that are merely alike also holds the difference of their commands.
-        Beside a leftover, that of repeats holds how much the model misses in each of them, which
-        differs where they begin or move apart.
-        """
-        return self.floor_at_most or self.floor_from in BOUNDS
 
     def tells(self, name: str, *columns: str) -> bool:
         """Check that the errors of a channel are meaningful: none of these columns runs away."""
@@ -434,8 +423,7 @@ def open_noise(rows: Sequence[RulerRow]) -> str:
 
 def noise_unknown(row: RulerRow, names: Sequence[str]) -> bool:
     """Check whether only an upper bound of the noise is known, and errors may be within it."""
-    within = any(row.above.get(name, 0.0) <= ABOVE for name in names)
-    return row.floor_from == AT_MOST or (row.floor_at_most and within)
+    return row.floor_at_most and any(row.above.get(name, 0.0) <= ABOVE for name in names)
 
 
 def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Any]:

@@ -419,7 +419,7 @@ class Diagnosis(Document):
         return document
 
     def figures(self) -> Sequence[Figure]:
-        """Return figures: predictions before and after, the credit, where the gap is."""
+        """Return figures: predictions before and after, and the credit."""
         return gap_figures(self)
 
     def _repr_html_(self) -> str:

@@ -1,4 +1,4 @@
-"""Figures of a diagnosis: predictions before and after, the credit, where the gap is."""
+"""Figures of a diagnosis: predictions before and after, and the credit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.telling import columns_told
 from grounded.figures.figure import Figure, Panel, bars, curve, legend, panel
-from grounded.result import figure, measured, measured_alike, percent, shown
+from grounded.result import measured_alike, percent, shown
 
 if TYPE_CHECKING:  # of which this is a part
     from grounded.diagnosis.parts import Diagnosis
@@ -33,7 +33,7 @@ def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
     """Return the figures of a diagnosis, most important first; none if no cause can be named."""
     if diagnosis.no_cause:
         return []
-    found = (accuracy_figure(diagnosis), credit_figure(diagnosis), where_figure(diagnosis))
+    found = (accuracy_figure(diagnosis), credit_figure(diagnosis))
     return [figure for figure in found if figure is not None]
 
 
@@ -114,35 +114,3 @@ def worth_of(name: str, error: RulerRow, diagnosis: Diagnosis) -> Panel | None:
     texts = measured_alike([v for _, v in known], error.unit_by_channel.get(name, ""))
     rows = [(label, v, t, role) for ((role, label), v), t in zip(known, texts, strict=True)]
     return bars(f"{name}: error {error.horizon_s:.3g} s ahead", rows) if rows else None
-
-
-def where_figure(diagnosis: Diagnosis) -> Figure | None:
-    """Return the shares of the gap by channel, time and region, and the evidence for effects."""
-    where = diagnosis.where
-    by_channel = [
-        (c.name, c.share, f", {measured(c.rms, c.unit)}" * math.isfinite(c.rms))
-        for c in where.channels
-        if math.isfinite(c.share)
-    ]
-    by_time = [(f"{t.start:.4g} to {t.end:.4g} s", t.share, "") for t in where.times]
-    by_region = [(r.told, r.share, f", {percent(r.occupancy)} occupancy") for r in where.regions]
-    panels = [
-        bars(
-            f"Share by {word}",
-            [(n, v, f"{percent(v)}{note}", role) for n, v, note in shares[:MOST_BARS]],
-        )
-        for word, shares, role in (
-            ("channel", by_channel, "best"),
-            ("time", by_time, "step2"),
-            ("region", by_region, "accepted"),
-        )
-        if shares
-    ]
-    if diagnosis.ranking:
-        evidence = [
-            (r.effect, r.evidence, figure(r.evidence, 3), "best" if r.claimed else "other")
-            for r in diagnosis.ranking[:MOST_BARS]
-        ]
-        panels.append(bars("Evidence [nats]", evidence))
-    title = "Where the gap is" if by_channel else "Effects compared"
-    return Figure("gap", title, "", panels) if panels else None

@@ -139,7 +139,7 @@ def errors_line(d: Diagnosis) -> Iterator[Finding]:
         whole=row.whole_trial,
         ahead=0.0 if row.whole_trial else row.horizon_s,
         who="it" if d.verdict.causes else "the model",
-        bound="yes" if row.floor_bound else "no",
+        bound="yes" if row.floor_at_most else "no",
         inside=row.held_out == "no",
         **facts,
     )
@@ -215,7 +215,7 @@ def columns_told(diagnosis: Diagnosis) -> dict[str, str]:
         del columns["calibrated"], columns["with_effects"]
     elif not any(row.calibrated for row in rows):
         del columns["calibrated"]
-    columns["noise_floor"] += ", at most" * any(row.floor_bound for row in rows)
+    columns["noise_floor"] += ", at most" * any(row.floor_at_most for row in rows)
     return columns
 
 

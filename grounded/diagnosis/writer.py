@@ -10,7 +10,6 @@ import numpy as np
 
 from grounded.diagnosis.causes import meaning, value_called
 from grounded.diagnosis.error_report import (
-    AT_MOST,
     ChannelShare,
     Credit,
     Gap,
@@ -189,7 +188,7 @@ class Writer:
             return Verdict("unknown", limit=claims.known.findings[0].code)
         claimed = tuple(row.effect for row in ranking if row.claimed)
         if not claimed:
-            bound = row is not None and (row.floor_at_most or row.floor_from == AT_MOST)
+            bound = row is not None and row.floor_at_most
             unsure = bound and not excess(rows) and not self.adopted
             return Verdict("unknown" if remainder or unsure else "none")
         off = tuple(self.data.model.param_names[one.index] for one in claims.moved)

@@ -31,7 +31,7 @@ __all__ = ["car", "cart"]
 
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
-FIGURES += ("gap", "forecast", "residual")
+FIGURES += ("forecast", "residual")
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ def test_json_names_the_files_that_were_written(cart, tmp_path):
     paths = grounded("-C", folder, "report", "--html", "--rrd", "--png", "--json").json["paths"]
     files = [paths["html"], paths["rrd"], *paths["png"]]
     assert all(Path(file).stat().st_size > 1000 for file in files)
-    assert {Path(p).stem for p in paths["png"]} >= {"utility", "paths", "states", "bias", "gap"}
+    assert {Path(p).stem for p in paths["png"]} >= {"utility", "paths", "states", "bias"}
 
 
 @pytest.mark.extra("view", "png")

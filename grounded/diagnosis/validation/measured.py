@@ -21,8 +21,6 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.error_report import (
-    AT_MOST,
-    BOUNDS,
     Credit,
     Part,
     Region,
@@ -70,7 +68,8 @@ class Measured:
         self.is_white = not self.left and min(told, default=0.0) * len(told) > CHANCE
         self.carried = carried(ruler, self.best)
         self.floor, self.source = self.noise_floor()  # sets `unsure`, std of its log, (K, 1)
-        self.at_most = self.source == "short horizon" and not self.is_white
+        by_repeats = self.source == "repeats"
+        self.at_most = not self.exact and bool(self.left) if by_repeats else not self.is_white
 
     def rms(self, fit: Fitted) -> Array:
         """Return the rms errors of a fit by horizon and shown state, (K, n')."""
@@ -103,10 +102,6 @@ class Measured:
             return np.zeros((len(self.ruler.steps) + 1, len(self.units))), "repeats"
         repeats = repeated(self.trials, self.data, self.first)
         scatter, source = self.ruler.scatter(self.best, repeats), "repeats"
-        if not all(len({self.trials[i].candidate or i for i in group}) == 1 for group in repeats):
-            source = "alike"
-        elif self.left:
-            source = AT_MOST
         off = [self.data.model.state_names.index(left.channel) for left in self.left]
         if scatter is None:
             found, source = self.carried.copy(), "short horizon"
@@ -258,7 +253,7 @@ class Measured:
                 floor=floor,
                 horizon_s=ruler.steps[at] * data.dt,
                 error_unit=self.units[name],
-                floor_at_most=self.at_most or self.source in BOUNDS,
+                floor_at_most=self.at_most,
                 part=self.part(at, ruler.shown[i], floor),
             )
             found.append((-error / max(floor, float(fine[i])), i, left, row))

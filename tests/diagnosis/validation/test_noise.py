@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.pictures import where_figure
 from grounded.effects import Library
 from small_tasks import DT, pushed_cart
 
@@ -34,7 +33,6 @@ def test_without_an_effect_the_error_is_noise():
     where = found.to_json()["where"]  # shares of noise would differ from day to day
     assert found.kind == "none" and where["times"] == where["regions"] == []
     assert {c["share"] for c in where["channels"]} == {None}
-    assert where_figure(found) is None or "channel" not in str(where_figure(found).panels[0].title)
 
 
 def test_repeats_of_a_candidate_tell_the_noise():

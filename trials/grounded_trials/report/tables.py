@@ -11,7 +11,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 from grounded.diagnosis.parts import Diagnosis, Estimate
-from grounded.diagnosis.pictures import accuracy_figure, credit_figure, where_figure
+from grounded.diagnosis.pictures import accuracy_figure, credit_figure
 from grounded.diagnosis.telling import error_table as held_out_table
 from grounded.diagnosis.telling import weighed_beside
 from grounded.errors import NextCommand
@@ -205,7 +205,7 @@ def _gap(findings: Findings) -> list[Block]:
         return [verdict, *ahead, *lacking]
     proof = _drawn(accuracy_figure(diagnosis), title=True)
     proof += _drawn(credit_figure(diagnosis), title=True)
-    found = [verdict, *proof, *ahead, *lacking, *_drawn(where_figure(diagnosis), title=True)]
+    found = [verdict, *proof, *ahead, *lacking]
     found += _titled("Errors of held-out predictions", "held-out", *held_out_table(diagnosis))
     return found + _effects(diagnosis, findings.since.adopted)
 
