@@ -98,8 +98,10 @@ def test_a_forecast_with_the_true_model_stays_on_the_trial_and_others_part_from_
 def test_results_plot_what_the_page_shows(cart):
     findings = gathered(cart)
     assert findings.diagnosis is not None and findings.best is not None
+    units, before, after = {"v": "m/s"}, {"v": 0.3}, {"v": 0.1}
+    errors = RulerRow(1.0, unit_by_channel=units, crude=before, with_effects=after)
     for result, titles in (
-        (findings.diagnosis, ("Share by channel",)),
+        (replace(findings.diagnosis, prediction_error=(errors,)), ("v [m/s]",)),
         (findings.standing, ("Utility of each candidate", "Step size")),
         (findings.best.candidate, ("x", "v", "force")),
     ):
