@@ -48,7 +48,6 @@ class CarRun:
     optimum: float
     trials: int
     alphas: tuple[float, ...]
-    paths: dict[str, list[list[float]]]  # x, y [m] by "target", "iteration 0", "iteration 1" ...
 
     @property
     def improvement(self) -> float:
@@ -58,7 +57,7 @@ class CarRun:
 
 @dataclass(frozen=True)
 class CarResult:
-    """All repetitions; those of Figures 4 and 5 are the first noisy ones."""
+    """All repetitions."""
 
     runs: tuple[CarRun, ...]
 
@@ -68,13 +67,8 @@ class CarResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `grounded experiment car --json`, a row per run."""
-        runs = [
-            {key: value for key, value in vars(run).items() if key != "paths"}
-            | {"improvement": run.improvement}
-            for run in self.runs
-        ]
-        figures = {name: some[0].paths for name in NAMES if (some := self.of(name, True))}
-        return {"runs": runs, "figures": figures, "paper": PAPER}
+        runs = [vars(run) | {"improvement": run.improvement} for run in self.runs]
+        return {"runs": runs, "paper": PAPER}
 
     def tables(self) -> list[StudyTable]:
         """Return improvement and trials beside the paper's, without and with scatter."""
@@ -177,11 +171,7 @@ def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
         case.true_utility(policy, fresh)
         for policy in (kept[0].candidate.policy, kept[-1].candidate.policy, case.optimum())
     ]
-    columns = [case.task.model.state_names.index(name) for name in ("x", "y")]
-    paths = {"target": case.task.target[:, columns].tolist()}
-    for i, tried in enumerate(kept):
-        paths[f"iteration {i}"] = tried.trials[0].states[:, columns].tolist()
     utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in found.candidates)
     first, last, top = true
-    run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas, paths)
+    run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas)
     return vars(CarRun(*run))

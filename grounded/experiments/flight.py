@@ -1,4 +1,4 @@
-"""Table 1 and Figure 1: a fixed-wing aircraft learns a figure-8 from a wrong model (section 5.1).
+"""Table 1: a fixed-wing aircraft learns a figure-8 from a wrong model (section 5.1).
 
     real system      the aircraft with its 43 true parameters, closed loop, no noise
     crude model      every parameter times an independent U[0.8, 1.2], one model a run
@@ -18,7 +18,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from grounded.checks import wrong
-from grounded.experiments.figure8 import RADIUS, figure8_target, flight_task, perturbed
+from grounded.experiments.figure8 import RADIUS, flight_task, perturbed
 from grounded.experiments.jobs import (
     Running,
     StudyTable,
@@ -47,7 +47,6 @@ PAPER = {
     "trials": 5,
     "discarded": 0.2,
 }
-FIGURE_STEP = 5  # Figure 1 is stored at 10 Hz
 
 
 @dataclass(frozen=True)
@@ -59,7 +58,6 @@ class FlightRun:
     utilities: tuple[float, ...]
     trials: int
     alphas: tuple[float, ...]  # of every trial; the first is the model's own policy
-    paths: dict[str, list[list[float]]]  # north, east, altitude [m] by "model" and "learned"
 
     @property
     def improvement(self) -> float:
@@ -69,21 +67,15 @@ class FlightRun:
 
 @dataclass(frozen=True)
 class FlightResult:
-    """Table 1, and the paths of Figure 1 for the run with the median improvement."""
+    """Table 1."""
 
     runs: tuple[FlightRun, ...]
     optimum: float
-    desired: list[list[float]]
 
     @property
     def flown(self) -> tuple[FlightRun, ...]:
         """The runs that were not discarded."""
         return tuple(run for run in self.runs if not run.discarded)
-
-    @property
-    def representative(self) -> FlightRun:
-        """The run of Figure 1."""
-        return sorted(self.flown, key=lambda run: run.improvement)[len(self.flown) // 2]
 
     def summary(self) -> dict[str, Any]:
         """Return the figures of Table 1."""
@@ -109,13 +101,8 @@ class FlightResult:
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `grounded experiment flight --json`: a row per run, and means."""
-        runs = [
-            {k: v for k, v in vars(run).items() if k != "paths"} | {"optimum": self.optimum}
-            for run in self.runs
-        ]
-        shown = self.representative
-        figure = {"seed": shown.seed, "desired": self.desired, **shown.paths}
-        return dict(plain({"runs": runs, **self.summary(), "figure": figure, "paper": PAPER}))
+        runs = [vars(run) | {"optimum": self.optimum} for run in self.runs]
+        return dict(plain({"runs": runs, **self.summary(), "paper": PAPER}))
 
     def tables(self) -> list[StudyTable]:
         """Return Table 1 beside the paper's."""
@@ -164,8 +151,7 @@ def run(
         cases = ({"seed": s} for s in range(seed, seed + missing))
         found += run_study(FlightRun, flight_job, cases, **how)
         seed += missing
-    path, _, _ = figure8_target()
-    return FlightResult(tuple(found), flight_optimum(), path[::FIGURE_STEP].tolist())
+    return FlightResult(tuple(found), flight_optimum())
 
 
 def flight_optimum() -> float:
@@ -183,19 +169,17 @@ def flight_job(seed: int) -> dict[str, Any]:
     first = propose(task, [], [], options).candidate
     if first is None or unstable(truth, flown := real_flight(truth, first)):
         if first is None:
-            return vars(FlightRun(seed, True, (), 1, (1.0,), {}))
+            return vars(FlightRun(seed, True, (), 1, (1.0,)))
         claimed = plain([truth.utility(flown)])  # JSON has no infinity
-        return vars(FlightRun(seed, True, claimed, 1, (1.0,), _paths(model=flown)))
+        return vars(FlightRun(seed, True, claimed, 1, (1.0,)))
 
     def fly(candidate: Candidate) -> Trial:
         return real_flight(truth, candidate)
 
     found = learn(task, fly, options, max_iterations=ITERATIONS, check=False)
-    assert found.best is not None
-    paths = _paths(model=found.trials[0], learned=found.best.trials[0])
     alphas = tuple(c.alpha for c in found.candidates)
     utilities = tuple(found.standing.utilities)
-    return vars(FlightRun(seed, False, utilities, len(found.trials), alphas, paths))
+    return vars(FlightRun(seed, False, utilities, len(found.trials), alphas))
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:
@@ -219,7 +203,3 @@ def unstable(truth: Task, flight: Trial) -> bool:
         return True
     error: Array = flight.states[:, :3] - truth.target[:, :3]
     return bool(np.linalg.norm(error, axis=1).max() > RADIUS)
-
-
-def _paths(**flights: Trial) -> dict[str, list[list[float]]]:
-    return {name: t.states[::FIGURE_STEP, :3].tolist() for name, t in flights.items()}

@@ -52,10 +52,6 @@ def test_flight_speaks_the_contract(flown):
         "optimum",
     }
     assert set(document["improvement"]) == {"mean", "se", "ratio_of_means"}
-    shown = document["figure"]
-    assert len(shown["desired"]) == len(shown["model"]) == len(shown["learned"]) == 601
-    error = np.abs(np.array(shown["learned"]) - shown["desired"]).max(axis=0)
-    assert error[2] < 1.0  # altitude [m], what the model-based controller can't hold
 
 
 def test_an_unstable_first_controller_is_discarded(monkeypatch):
@@ -101,4 +97,3 @@ def test_the_car_learns_its_turn_though_its_runs_scatter():
     assert result.runs[0].improvement == pytest.approx(0.989, abs=0.002)
     document = plain(result)
     assert {run["noisy"] for run in document["runs"]} == {False, True}
-    assert {"target", "iteration 0"} <= {*document["figures"]["turn"]}
