@@ -104,10 +104,9 @@ def identified(
 
     If a calibrated value states a larger standard deviation than the information, it is used.
 
-    Parameters that are not identifiable one by one may be so together: the calibrated values differ
-    from nominal in one direction, and if that direction is identifiable, so is what is adopted. So
-    is one that is identifiable if all others are as calibrated: a boat's masses, drags and thrust
-    are known but for one factor of all, and without the thrust the others were worse than nothing.
+    Parameters that are not identifiable one by one may be so together, if all others are as
+    calibrated: a boat's masses, drags and thrust are known but for one factor of all, and without
+    the thrust the others were worse than nothing.
 
     Args:
         predictor: evaluates hypotheses, with all uncertain parameters free.
@@ -147,7 +146,6 @@ def identified(
     # each parameter: alone, with the others, and what it is given by
     cov, rows = C[k:, k:], list[Identifiable]()
     precision = np.linalg.inv(cov)
-    together = _jointly(cov, names, priors, model, known)
     for i, name in enumerate(names):
         stated = known[name].std if name in known else 0.0
         share = max(float(std[k + i]), min(stated / priors[i], 1.0))
@@ -159,9 +157,10 @@ def identified(
                     slope = cov[i, j] / cov[j, j] * priors[i] / priors[j]
                     given[names[j]] = float(slope * size)
         alone = _verdict(share)
-        with_others = _verdict(float(precision[i, i] ** -0.5)) != "not identifiable"
-        also = (together or with_others) and alone == "not identifiable" and name in known
-        also = (also or name in joint) and (held_out or alone != "not identifiable")
+        lost = alone == "not identifiable"
+        together = _verdict(float(precision[i, i] ** -0.5)) != "not identifiable"
+        also = (together and lost and name in known) or name in joint
+        also = also and (held_out or not lost)
         rows.append(Identifiable(name, alone, float(priors[i]), share, given, also))
     return Identified(tuple(rows), tuple(found), wide)
 
@@ -226,28 +225,6 @@ def _joined(pins: Mapping[int, set[int]]) -> Sequence[list[int]]:
         groups = [g for g in groups if g not in near]
         groups.append(({i}.union(*(g[0] for g in near)), own.union(*(g[1] for g in near))))
     return [sorted(members) for members, _ in groups]
-
-
-def _jointly(
-    cov: Array,
-    names: Sequence[str],
-    priors: Array,
-    model: Model,
-    known: Mapping[str, Estimate],
-) -> bool:
-    """Check whether the data identify the direction in which the parameters were moved.
-
-    Args:
-        cov: posterior covariance (K, K) in units of the priors.
-        names: the uncertain parameters (K).
-        priors: their prior standard deviations (K,).
-        model: holds their nominal values.
-        known: the calibrated values.
-    """
-    off = [known[n].value - model.params[n].value if n in known else 0.0 for n in names]
-    along = np.array(off) / priors
-    size = float(along @ along)
-    return size > 0 and _verdict(float(np.sqrt(along @ cov @ along / size))) != "not identifiable"
 
 
 def _verdict(left: float) -> str:
