@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, Writer
 
-from bombs import explode, log
+from bombs import KINDS, explode, log
 from facts import holding
 from grounded.errors import GroundedError
 from grounded.trial import Trial
@@ -30,9 +30,7 @@ from pace import slowness
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(  # all of them: benchmarks/attack.py
-    "name", ["JSON, nested lists", "zeros, zstd", "SQLite, an endless view"]
-)
+@pytest.mark.parametrize("name", KINDS)
 def test_every_bomb_ends_in_time(name: str, tmp_path: Path) -> None:
     told = {what: cost.wrong for what, cost in explode(name, tmp_path, budget_s=1.0).items()}
     assert not any(told.values()), told
