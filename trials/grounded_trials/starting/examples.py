@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.checks import known, refused
 from grounded.task import Task
+from grounded_trials.starting.first_toml import TASK, inline, number
 from grounded_trials.store.store import made_folder, sweep, write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.user_files.config import FILE
@@ -109,14 +110,10 @@ def example(name: str) -> Example:
 def write_example(folder: Path, name: str) -> None:
     """Write the workspace of an example; never overwrites a file.
 
-    An interrupted call can be repeated: files that already exist with the same contents are
-    accepted, and grounded.toml, which makes the folder a workspace, is written last.
-
     Raises:
         GroundedError: if the folder already holds a workspace, or can't be written.
     """
     chosen = example(name)
-    refuse_existing(folder, [FILE])
     task = chosen.task()
     columns = {
         state: task.target[:, i]
@@ -125,27 +122,9 @@ def write_example(folder: Path, name: str) -> None:
     }
     files = {"target.csv": target_text(task.dt, columns), "model.py": _source(chosen.module)}
     files |= {"real.py": chosen.real, FILE: toml_of(task, name)}
-    refuse_existing(
-        folder, [file for file, text in files.items() if not _holds(folder / file, text)]
-    )
-    with fresh_folder(folder, ()):
+    with fresh_folder(folder, files):
         for file, text in files.items():
             write_atomically(folder / file, text.encode())
-
-
-def refuse_existing(folder: Path, names: Iterable[str]) -> None:
-    """Raise an error if one of the files exists.
-
-    Raises:
-        GroundedError: naming the first file that exists.
-    """
-    for path in (folder / name for name in names):
-        if path.exists():
-            raise refused("file.exists", path)
-
-
-def _holds(path: Path, text: str) -> bool:
-    return path.is_file() and path.stat().st_size < 10**7 and path.read_bytes() == text.encode()
 
 
 @contextmanager
@@ -161,7 +140,9 @@ def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
     Raises:
         GroundedError: if one of the files exists, or the folder can't be created.
     """
-    refuse_existing(folder, files)
+    for path in (folder / name for name in files):
+        if path.exists():
+            raise refused("file.exists", path)
     new = not folder.exists()
     try:
         for made in (folder, folder / "trials", folder / "candidates"):
@@ -184,35 +165,11 @@ def _source(module: ModuleType) -> str:
 SIMULATED = 'model = "real.py"             # robot: command = "python drive.py {candidate} {trial}"'
 
 
-TASK = """# {name}
-
-[model]
-file = "model.py"             # the crude model
-smoothing = {smoothing}              # width over which planning smooths np.where, abs ...
-
-[task]
-dt = {dt}                     # [s] control interval
-horizon = {horizon}                 # steps
-target = "target.csv"         # states without a column are free
-start = {start}
-feedback = {feedback}               # false: open loop
-latency = {latency}
-
-[reward]                      # quadratic weights; utility = -sum
-{weights}
-
-[limits]                      # hard limits of the real inputs
-{limits}
-
-[search]
-method = "ddp"                # or "policy-gradient"
+SYSTEM = "[system]                      # how `grounded run` reaches the real system"
+SEARCH = """method = "ddp"                # or "policy-gradient"
 step = "damped"               # as in the paper: "full", and match_inputs = false
 repeats = 1                   # trials per candidate, averaged
 rerun_incumbent = true        # repeat the best candidate after a loss within the noise
-max_trials = 40
-
-[system]                      # how `grounded run` reaches the real system
-{system}
 """
 
 
@@ -240,30 +197,21 @@ def toml_of(task: Task, name: str, system: str = SIMULATED, *, explicit: bool = 
         "input_change": dict(zip(inputs, reward.input_change, strict=True)),
     }
     limits = [
-        f"{key(i)} = [{_number(low)}, {_number(high)}]"
+        f"{key(i)} = [{number(low)}, {number(high)}]"
         for i, low, high in zip(inputs, task.low, task.high, strict=True)
         if np.isfinite(low) and np.isfinite(high)
     ]
+    lines = (f"{k} = {inline({n: w for n, w in v.items() if w})}" for k, v in weights.items())
     return TASK.format(
-        name=f"{name}: {EXAMPLES[name].text}" if name in EXAMPLES else name,
-        smoothing=_number(task.smoothing),
-        dt=_number(task.dt),
+        title=f"{name}: {EXAMPLES[name].text}" if name in EXAMPLES else name,
+        model=f"smoothing = {number(task.smoothing)}              # of np.where, abs ...\n",
+        dt=number(task.dt),
         horizon=task.horizon,
-        start=_table(start),
-        feedback="true" if task.feedback else "false",
-        latency=_table(latency),
-        weights="\n".join(
-            f"{k} = {_table({n: w for n, w in v.items() if w})}" for k, v in weights.items()
-        ),
+        start=inline(start),
+        feedback=str(task.feedback).lower(),
+        latency=inline(latency),
+        weights="\n".join(lines),
         limits="\n".join(limits),
-        system=system + "\nseed = 0" * (system == SIMULATED),
+        search=SEARCH,
+        rest=f"{SYSTEM}\n{system}" + "\nseed = 0" * (system == SIMULATED),
     )
-
-
-def _number(value: float) -> str:
-    return repr(round(float(value), 12))
-
-
-def _table(values: Mapping[str, float]) -> str:
-    inside = ", ".join(f"{key(name)} = {_number(value)}" for name, value in values.items())
-    return f"{{ {inside} }}" if inside else "{ }"

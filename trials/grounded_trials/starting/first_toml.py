@@ -22,25 +22,34 @@ from grounded_trials.workspace.user_files.task_file import change_weight, write_
 BEGAN = 0.1  # [s] at its start in which one may stand still that nothing has to hold
 
 
-FIRST = """# made from a log by `grounded init --from` ({why})
+TASK = """# {title}
 
 [model]
 file = "model.py"             # the crude model
-
+{model}
 [task]
 dt = {dt}                     # [s] control interval
 horizon = {horizon}                 # steps
 target = "target.csv"         # `grounded target` draws another; no column: free
 start = {start}
-feedback = true               # false: open loop
-latency = {latency}  # [s] transport delay of inputs, unless `diagnose` finds it
+feedback = {feedback}               # false: open loop
+latency = {latency}  # [s] transport delay of inputs
 
-[reward]                      # quadratic weights: 1 / (range in the target, at least
-                              # 0.1)^2, for coordinates of a position the smaller range
-                              # (at least a fifth of the larger), a tenth of it for a
-                              # velocity beside its position; a constant column uses the
-                              # largest range of its unit, else 1. `target` updates them
-                              # until you change one
+[reward]                      # quadratic weights; utility = -sum
+{weights}
+
+[limits]                      # hard limits of the real inputs
+{limits}
+
+[search]
+{search}max_trials = 40
+
+{rest}
+"""
+WEIGHTS = """# 1 / (range in the target, at least 0.1)^2; for coordinates of a position the smaller
+# range (at least a fifth of the larger), a tenth of it for a velocity beside its
+# position; a constant column uses the largest range of its unit, else 1. `target` updates
+# them until you change one
 state = {state}
 # terminal: weights of the last step only. If the run must END at rest on its target
 # (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds
@@ -49,18 +58,20 @@ state = {state}
 # you change them, `target` sets them to 0.04 / (range in [limits])^2. To know whether
 # you did, it compares them with the next line: leave that one as it is
 # input_change = {changes}
-input_change = {changes}
-
-[limits]
-{limits}
-
-[search]
-max_trials = 40
-
-{table}
-"""
+input_change = {changes}"""
 SEEN = """# SEEN in the log, 0 included: enter those of your robot, then delete these two lines
 seen_in = {log}"""
+
+
+def number(value: float) -> str:
+    """Return a number as TOML."""
+    return repr(round(float(value), 12))
+
+
+def inline(values: Mapping[str, float]) -> str:
+    """Return numbers by name as an inline table."""
+    inside = ", ".join(f"{key(name)} = {number(value)}" for name, value in values.items())
+    return f"{{ {inside} }}" if inside else "{ }"
 
 
 def write_first(
@@ -101,18 +112,25 @@ def write_first(
         for name in model.input_names
         if (found := ranges[name]) is not None and found[0] < found[1]
     ]
-    seen = SEEN.format(log=json.dumps(log, ensure_ascii=False)) if limits else ""
-    text = FIRST.format(
-        why=why,
-        dt=f"{dt:g}",
+    if limits:
+        limits.append(SEEN.format(log=json.dumps(log, ensure_ascii=False)))
+    offered = {name: OFFERED * weight for name, weight in weights.items()}
+    state, terminal, change = (
+        inline({name: _rounded(value) for name, value in some.items()})
+        for some in (weights, offered, changes)
+    )
+    text = TASK.format(
+        title=f"made from a log by `grounded init --from` ({why})",
+        model="",
+        dt=number(dt),
         horizon=horizon,
-        start=_inline(held) if held else "{ }",
-        latency=_inline(late) if late else "{ }",
-        state=_inline(weights),
-        terminal=_inline({name: OFFERED * weight for name, weight in weights.items()}),
-        changes=_inline(changes),
-        limits="\n".join((*limits, seen)) if limits else "# those of your robot",
-        table=table.rstrip(),
+        start=inline({name: _rounded(value) for name, value in held.items()}),
+        feedback="true",
+        latency=inline({name: _rounded(value) for name, value in late.items()}),
+        weights=WEIGHTS.format(state=state, terminal=terminal, changes=change),
+        limits="\n".join(limits) or "# those of your robot",
+        search="",
+        rest=table.rstrip(),
     )
     write_atomically(folder / FILE, text.encode())
 
@@ -167,5 +185,5 @@ def _span(ends: Sequence[float]) -> str:
     return f"[{', '.join(f'{end:.6g}' for end in ends)}]"
 
 
-def _inline(values: Mapping[str, float]) -> str:
-    return "{ " + ", ".join(f"{key(name)} = {value:.6g}" for name, value in values.items()) + " }"
+def _rounded(value: float) -> float:
+    return float(f"{value:.6g}")
