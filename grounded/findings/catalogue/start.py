@@ -89,8 +89,7 @@ ENTRIES: dict[str, Entry] = {
     "follows_path": Entry(
         "refuse",
         "--to {about}={asked} can't be chosen: {why:path=the shape sets it,ends=the path ends "
-        "with another,rest=the line ends at rest,swing=it would be held during the swing}[[, "
-        "{end}]]",
+        "with another,rest=the line ends at rest}",
         "omit it[[rate?, or ask for 0 (--to {about}=0)]]"
         "[[; --hold 1 lets the path end at rest and stay there{hold:1=}]]",
     ),

@@ -26,9 +26,6 @@ PATHS = ("line", "circle", "figure-8")
 SHAPES = (*PATHS, "step")
 FEWEST = 5  # control steps of a target; at most MAX_HORIZON
 FINE = 2000  # number of points of a path
-SAME_VELOCITY = 1e-6  # of a velocity: two are the same
-CARRIES = 0.02  # of a path's highest rate: a velocity that makes up for less does not carry it
-BRIEF = 1e-4  # [s] of the step there
 
 
 @dataclass(frozen=True)
@@ -59,8 +56,7 @@ def path_target(
         model: its roles name the states.
         dt: control interval [s].
         to: further states, each with the value that it keeps along the path: a drone's height. A
-            velocity that carries the robot along follows the path instead, and must end at its
-            value: 0 with `drive.hold`.
+            velocity follows the path instead, and must end at its value: 0 with `drive.hold`.
         start: [task] start: where the path begins, and the height unless `to` gives one.
 
     Raises:
@@ -90,8 +86,7 @@ def path_target(
         played = model.roles.get(role)
         if isinstance(played, str) and played in model.states:
             columns[played] = values
-    rates = dict(zip(position, (pace * np.cos(turned), pace * np.sin(turned)), strict=False))
-    return columns | _kept(shape, model, to, start, columns, rates)
+    return columns | _kept(model, to, start, columns, bool(drive.hold))
 
 
 def _roles(model: Model) -> str:
@@ -123,80 +118,39 @@ def _driven(
 
 
 def _kept(
-    shape: str,
     model: Model,
     to: Mapping[str, float],
     start: Mapping[str, float],
     drawn: Mapping[str, Array],
-    rates: Mapping[str, Array],
+    at_rest: bool,
 ) -> dict[str, Array]:
-    """Return the columns of states that keep a value along a path, or carry the robot along it."""
+    """Return the columns of states that keep a value along a path."""
     _check_states(to, model)
-    held, speeds = dict(to), velocities_of(model)
-    for name in to:
-        if name in drawn and name not in speeds:
+    held = _placed(to, model, at_rest)
+    for name in held:
+        if name in drawn:
             raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="path")
-    for name in [n for n in to if n in drawn]:
-        _check_end(shape, name, held.pop(name), drawn[name][-1], model)
     for height in model.roles["position"][2:]:
         if height not in {**start, **to}:
             raise wrong(f"--to {height}", must="given", like=f"--to {height}=1.5")
         held.setdefault(height, start.get(height, 0.0))
     rows = len(next(iter(drawn.values())))
-    columns = {name: np.full(rows, value) for name, value in held.items()}
-    carrying = _carrying(model, {**drawn, **columns}, rates, [*to])
-    for name, column in carrying.items():
-        _check_end(shape, name, to[name], column[-1], model)
-    return columns | carrying
+    return {name: np.full(rows, value) for name, value in held.items()}
 
 
-def _check_end(shape: str, name: str, asked: float, end: float, model: Model) -> None:
-    """Raise if a path ends with another velocity than --to asks for."""
-    if abs(end - asked) > SAME_VELOCITY * max(abs(asked), 1.0):
-        unit = model.states[name]
-        facts = {"end": f"{end:.3g} {unit}", "hold": int(asked == 0)}
-        raise refused("start.follows_path", name, asked=f"{asked:g}", why="ends", rate=1, **facts)
+def _placed(to: Mapping[str, float], model: Model, at_rest: bool) -> dict[str, float]:
+    """Return what --to asks of states that are no velocities, which follow a line or path.
 
-
-def _carrying(
-    model: Model, columns: Mapping[str, Array], rates: Mapping[str, Array], names: list[str]
-) -> dict[str, Array]:
-    """Return the columns of velocities that a path can't hold, since they move the robot along it.
-
-    A velocity s carries the robot if, with s at its column, the model's rates q' of the drawn
-    states miss the path's by d, and s could make up for that: with g = dq'/ds, g.d is not 0. Then
-    s + g.d / g.g is what the path needs. The sideways velocity of a car that drives along its
-    heading has g.d = 0, and stays as it is.
-
-    Args:
-        model: the model of the states.
-        columns: all columns of the target, (H + 1,) each.
-        rates: the rates of states that the path moves, (H + 1,) each.
-        names: the states that may carry the robot.
+    Raises:
+        GroundedError: for a velocity that it does not end with.
     """
-    index = {name: i for i, name in enumerate(model.state_names)}
-    x = np.zeros((len(next(iter(columns.values()))), model.n))
-    for name, column in columns.items():
-        x[:, index[name]] = column
-    moved = [index[name] for name in rates]
-    wanted = np.stack([*rates.values()], axis=1)
-
-    def rate(x: Array) -> Array:
-        u = np.zeros((len(x), model.m))
-        with np.errstate(all="ignore"):
-            after = model.system.step(x, u, model.values, BRIEF)
-        return np.asarray((after - x)[:, moved] / BRIEF)
-
-    found = {}
-    for name in [n for n in names if n in velocities_of(model) and n not in rates]:
-        more = x.copy()
-        more[:, index[name]] += 1.0
-        missed, g = wanted - rate(x), rate(more) - rate(x)
-        size = np.maximum((g**2).sum(axis=1), SAME_VELOCITY)
-        needed = (g * missed).sum(axis=1) / size
-        if np.abs(needed * np.sqrt(size)).max() > CARRIES * np.abs(wanted).max():
-            found[name] = x[:, index[name]] + needed
-    return found
+    moving = [name for name in to if name in velocities_of(model)]
+    for name in moving:
+        if to[name] or not at_rest:
+            why = "rest" if at_rest else "ends"
+            facts = {"why": why, "rate": 1, "hold": int(not to[name])}
+            raise refused("start.follows_path", name, asked=f"{to[name]:g}", **facts)
+    return {name: value for name, value in to.items() if name not in moving}
 
 
 def _check(drive: Drive) -> None:
@@ -233,8 +187,8 @@ def line_target(
 ) -> dict[str, Array]:
     """Return the columns, (H + 1,) each, of a straight line from rest to rest, with their rates.
 
-    If one coordinate of a position is named, the others stay at their start values. A velocity that
-    carries the robot along the line follows it, and ends at 0.
+    If one coordinate of a position is named, the others stay at their start values. A velocity
+    beside them follows the line, and ends at 0.
 
     Args:
         to: end value by state; empty: `drive.size` further along the model's only axis.
@@ -254,6 +208,8 @@ def line_target(
     _check(drive)
     to = to or {(name := _axis(model)): start.get(name, 0.0) + drive.size}
     _check_states(to, model)
+    if not {*to} <= {*velocities_of(model)}:  # else they are what is moved
+        to = _placed(to, model, at_rest=True)
     way = {name: value - start.get(name, 0.0) for name, value in to.items()}
     length = max(map(abs, way.values()))
     if not 0 < length < np.inf:
@@ -275,12 +231,7 @@ def line_target(
     way |= dict.fromkeys([q for q in place if q not in way and not {*place}.isdisjoint(way)], 0.0)
     columns |= {q: np.full(len(t), start.get(q, 0.0)) for q in way if q not in columns}
     columns |= {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
-    moved = {q: rate * far for q, far in way.items() if far and q not in velocities_of(model)}
-    carrying = _carrying(model, columns, moved, [*to]) if moved else {}
-    for name in carrying:
-        if to[name]:
-            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="rest", rate=1)
-    return columns | carrying
+    return columns
 
 
 def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
