@@ -499,7 +499,6 @@ def test_next_ingests_proposes_and_exports(tmp_path):
     found = json.loads(done.out)
     assert found["trials"][0]["candidate"] == "c0001" and found["propose"]["candidate"] == "c0002"
     assert (tmp_path / "w/c0002.npz").exists() and (tmp_path / "w/grounded_runner.py").exists()
-    assert found["removed"] == []
 
 
 def test_a_target_beyond_safety_is_told_when_it_is_drawn(tmp_path):
