@@ -384,14 +384,11 @@ class System(ABC):
         """What `rollout` returns, a run for each of alphas (A,)."""
 
     @abstractmethod
-    def backward(
-        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
-    ) -> Backward:
+    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
         """Linearise along z (H+1, nz), u (H, m) and sweep back, Q_uu + diag(damping), damping (m,).
 
         Input limits are part of each step's quadratic programme (box-DDP, Tassa et al. 2014): the
-        rows of K of a clamped input are zero. `into` is an earlier result that nobody needs any
-        more: its arrays may be used again.
+        rows of K of a clamped input are zero.
         """
 
     def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:

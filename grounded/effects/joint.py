@@ -35,7 +35,6 @@ from grounded.model import Model
 ALIKE = 0.999  # cosine from which two slopes are equivalent
 ONLY = 2e-3  # relative response of other states below which an input drives one speed alone
 TURNS = 4  # factor on the number of samples for positions over their whole range
-VARIED_BY = 0.1  # fraction of a parameter's uncertainty by which it is varied
 FORCES = ("N", "V", "A")  # first letters of the units of efforts: N m, V ...
 
 

@@ -136,7 +136,7 @@ def descended(
     if not np.isfinite(state.cost):
         return ended("not finite")
     while True:
-        found = sweep(problem, state.z, state.u, mu=state.mu, into=gains)
+        found = sweep(problem, state.z, state.u, mu=state.mu)
         gains = found.gains
         if not found.ok:
             return ended("not finite", gains.failed_at)
@@ -251,21 +251,14 @@ class Sweep:
         return self.gains.failed_at < 0
 
 
-def sweep(
-    problem: Problem,
-    z: Array,
-    u: Array,
-    mu: float = 0.0,
-    into: Backward | None = None,
-) -> Sweep:
+def sweep(problem: Problem, z: Array, u: Array, mu: float = 0.0) -> Sweep:
     """Sweeps back along z (H+1, nz), u (H, m) with damping mu * problem.input_scale.
 
     mu grows tenfold after each failure; when it passes 1e10 the failed sweep is returned, with
-    `ok` False: the trajectory or the model holds no finite numbers. `into`: see `System.backward`.
+    `ok` False: the trajectory or the model holds no finite numbers.
     """
-    gains = into
     while True:
-        gains = problem.system.backward(problem, z, u, mu * problem.input_scale, gains)
+        gains = problem.system.backward(problem, z, u, mu * problem.input_scale)
         if gains.failed_at < 0 or mu >= CEILING:
             return Sweep(gains, mu)
         mu = max(FLOOR, GROWTH * mu)

@@ -237,18 +237,13 @@ class CompiledSystem(TracedSystem):
             run(kernel, table(ROLLOUT, known.words, values))
         return Swarm(z, u, cost)
 
-    def backward(
-        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
-    ) -> Backward:
+    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
         """See `System.backward`."""
         if self.m > MAX_INPUTS:
             return super().backward(problem, z, u, damping)
         H, nz = problem.horizon, problem.nz
         expected = np.zeros(2)
-        if into is not None and into.K.shape == (H, self.m, nz):
-            k, K = into.k, into.K
-        else:
-            k, K = np.empty((H, self.m)), np.empty((H, self.m, nz))
+        k, K = np.empty((H, self.m)), np.empty((H, self.m, nz))
         values = {"z_run": plain(z), "u_run": plain(u), "damping": plain(damping)}
         values |= {"k": k, "K": K, "expected": expected}
         library, jacobian = self._search(problem)

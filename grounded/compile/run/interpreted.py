@@ -198,9 +198,7 @@ class Interpreted(System):
 
         return rolled_out(problem, step, by, alphas)
 
-    def backward(
-        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
-    ) -> Backward:
+    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
         """See `System.backward`."""
         with np.errstate(all="ignore"):
             return sweep(problem, u, linearised(self, problem, z, u), damping)

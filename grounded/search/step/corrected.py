@@ -151,9 +151,7 @@ class Corrected(System):
         y = np.einsum("...nq,...q->...n", self.law[t], d)
         return np.concatenate([moved + y, y, u], axis=1)
 
-    def backward(
-        self, problem: Problem, z: Array, u: Array, damping: Array, into: Backward | None = None
-    ) -> Backward:
+    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
         """See `System.backward`."""
         with np.errstate(all="ignore"):
             return sweep(problem, u, linearised(self, problem, z, u), damping)
