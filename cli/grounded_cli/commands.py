@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import click
+from click import Choice, FloatRange, IntRange, argument, option
 
 from grounded import __version__
 from grounded.errors import GroundedError
@@ -57,47 +58,39 @@ details = flag("--details", help="Tell all notes, with codes.")
 anyway = flag(
     "--anyway", help="Hand the candidate over even if [limits], [safety], task or model changed."
 )
-only_trials = click.option(
-    "--trials", metavar="T1,T2,...", help="Only these trials (default: all)."
-)
-which_candidate = click.option("--candidate", metavar="ID", help="Which candidate was run.")
-without = click.option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
-folder = click.argument("folder", metavar="DIR")
+only_trials = option("--trials", metavar="T1,T2,...", help="Only these trials (default: all).")
+which_candidate = option("--candidate", metavar="ID", help="Which candidate was run.")
+without = option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
+folder = argument("folder", metavar="DIR")
+above = FloatRange(min=0, min_open=True)
 
 
 # a workspace, its manoeuvre, its first drive
 
 
 @command(cli, "init", workspace=False)
-@click.argument("folder", metavar="DIR", required=False)
-@click.option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
-@click.option(
-    "--model",
-    metavar="FILE",
-    help="Your model.py, or an MJCF or URDF file, beside --from or --blank.",
-)
+@argument("folder", metavar="DIR", required=False)
+@option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
+@option("--model", metavar="FILE", help="Your model.py, MJCF or URDF, beside --from or --blank.")
 @flag("--blank", help="No log yet: a workspace of --model, to fill in.")
-@click.option(
+@option(
     "--kind",
-    help="Kind of model skeleton: car, rover, differential, boat, balance, drone, arm, pendulum, "
-    "crane, generic.",
+    metavar="KIND",
+    help="car, rover, differential, boat, balance, drone, arm, pendulum, crane or generic.",
 )
-@click.option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
+@option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @table_layout
-@click.option(
-    "--dt",
-    type=click.FloatRange(min=0, min_open=True),
-    metavar="SECONDS",
-    help="Control interval (the log's; 0.05 with --blank).",
+@option(
+    "--dt", type=above, metavar="SECONDS", help="Control interval (the log's; 0.05 with --blank)."
 )
-@click.option(
+@option(
     "--actuators",
     multiple=True,
     metavar="FILE[:INPUT,...]",
-    help="Begin with an actuator that `export --library` wrote, for inputs of its unit or these.",
+    help="Actuators by `export --library`.",
 )
 @flag("--yes", help="Ask nothing: use the best guesses, marked as such.")
-@click.option("--example", metavar="NAME", help="Which example (see --list).")
+@option("--example", metavar="NAME", help="Which example (see --list).")
 @flag("--list", help="List the examples.")
 def init() -> None:
     """Make a workspace from a log or an example.
@@ -111,25 +104,20 @@ def init() -> None:
 
 
 @command(cli, "target")
-@click.argument("shape", metavar="SHAPE|FILE")
-@click.option(
-    "--size",
-    type=float,
-    help="Length of a line, radius of a circle, half the width of a figure-8's loops [m] (2).",
-)
-@click.option("--speed", type=float, help="Maximum speed [m/s] (1).")
-@click.option("--accel", type=float, help="Maximum acceleration along the path [m/s^2] (1).")
-@click.option("--lateral", type=float, help="Maximum lateral acceleration [m/s^2] (4).")
-@click.option("--laps", type=float, help="Laps of a circle or figure-8 (1).")
-@click.option("--hold", type=float, help="Time at rest at a path's end [s] (0).")
-@click.option(
+@argument("shape", metavar="SHAPE|FILE")
+@option("--size", type=float, help="Length of a line, radius, half a figure-8's width [m] (2).")
+@option("--speed", type=float, help="Maximum speed [m/s] (1).")
+@option("--accel", type=float, help="Maximum acceleration along the path [m/s^2] (1).")
+@option("--lateral", type=float, help="Maximum lateral acceleration [m/s^2] (4).")
+@option("--laps", type=float, help="Laps of a circle or figure-8 (1).")
+@option("--hold", type=float, help="Time at rest at a path's end [s] (0).")
+@option(
     "--to",
     multiple=True,
     metavar="STATE=VALUE",
-    help="Where a line or step ends; what a state keeps along a path (a height). "
-    "A velocity along a line or path follows it, and must end at this value.",
+    help="Where it ends, or what a path keeps (a height).",
 )
-@click.option("--seconds", type=float, help="Duration of a step (5), or of a line to a STATE.")
+@option("--seconds", type=float, help="Duration of a step (5), or of a line.")
 @flag("--rest", help="Let the states that a line leaves free rest at its end, by weights.")
 @details
 def target() -> None:
@@ -151,7 +139,7 @@ def target() -> None:
 
 
 @command(cli, "excite")
-@click.option("--seconds", type=float, help="Its duration (5 to 40, until no parameter is weak).")
+@option("--seconds", type=float, help="Its duration (5 to 40, until no parameter is weak).")
 def excite() -> None:
     """Write the drive to record first, before there is a target.
 
@@ -175,7 +163,7 @@ def propose() -> None:
 
 
 @command(cli, "run", "learn")
-@click.argument("candidate", required=False)
+@argument("candidate", required=False)
 @anyway
 def run() -> None:
     """Run the candidate on the system of grounded.toml.
@@ -187,13 +175,11 @@ def run() -> None:
 
 
 @command(cli, "ingest")
-@click.argument("files", nargs=-1, required=True, metavar="FILE...")
+@argument("files", nargs=-1, required=True, metavar="FILE...")
 @which_candidate
 @flag("--data", help="The log ran no candidate: for fit and diagnose only.")
-@click.option("--group", default="", metavar="NAME", help="A condition that no signal shows: wet.")
-@click.option(
-    "--before", multiple=True, metavar="U=0", help="An input before a log that begins with a step."
-)
+@option("--group", default="", metavar="NAME", help="A condition that no signal shows: wet.")
+@option("--before", multiple=True, metavar="U=0", help="An input before the log.")
 @details
 def ingest() -> None:
     """Check, resample and store the log of a run.
@@ -205,7 +191,7 @@ def ingest() -> None:
 
 
 @command(cli, "next", "ingest")
-@click.argument("log", metavar="LOG")
+@argument("log", metavar="LOG")
 @which_candidate
 @details
 def following() -> None:
@@ -217,8 +203,8 @@ def following() -> None:
 
 
 @command(cli, "discard")
-@click.argument("trials", nargs=-1, required=True, metavar="TRIAL...")
-@click.option("--why", default="", metavar="TEXT", help="The reason; `status` shows it.")
+@argument("trials", nargs=-1, required=True, metavar="TRIAL...")
+@option("--why", default="", metavar="TEXT", help="The reason; `status` shows it.")
 def discard() -> None:
     """Set a trial aside; nothing is deleted.
 
@@ -228,13 +214,13 @@ def discard() -> None:
 
 
 @command(cli, "restore", "discard")
-@click.argument("trials", nargs=-1, required=True, metavar="TRIAL...")
+@argument("trials", nargs=-1, required=True, metavar="TRIAL...")
 def restore() -> None:
     """Use a discarded trial again."""
 
 
 @command(cli, "learn")
-@click.option("--trials", type=click.IntRange(min=1), metavar="N", help="At most N trials now.")
+@option("--trials", type=IntRange(min=1), metavar="N", help="At most N trials now.")
 def learn() -> None:
     """Propose, run and ingest until the search ends.
 
@@ -276,7 +262,7 @@ def view() -> None:
 
 @command(cli, "fit")
 @only_trials
-@click.option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
+@option("--params", metavar="A,B,...", help="Fit only these; the others keep their values.")
 @flag("--latency", help="Fit one transport delay of all inputs too.")
 @flag("--apply", help="Write the values to grounded.toml.")
 @parallel("all processors")
@@ -291,18 +277,15 @@ def fit() -> None:
 
 @command(cli, "diagnose")
 @only_trials
-@click.option(
+@option(
     "--max-effects",
-    type=click.IntRange(1, 12),
+    type=IntRange(1, 12),
     metavar="K",
-    help="Claim at most K effects, 1 to 12 (default: 3, more if they leave a gap).",
+    help="Claim at most K effects (3, more for a gap).",
 )
 @without
-@click.option(
-    "--compare",
-    nargs=2,
-    metavar="A B",
-    help="Two groups of trials, T1,T2 T3,T4: what changed.",
+@option(
+    "--compare", nargs=2, metavar="A B", help="Two groups of trials, T1,T2 T3,T4: what changed."
 )
 @parallel("all processors")
 @flag("--details", help="Also all findings, errors, rival effects and places.")
@@ -316,7 +299,7 @@ def diagnose() -> None:
 
 
 @command(cli, "adopt")
-@click.argument("effects", nargs=-1, metavar="EFFECT...")
+@argument("effects", nargs=-1, metavar="EFFECT...")
 @flag("--effect-only", help="Leave the model's own parameters alone.")
 @flag("--undo", help="Undo the last adoption.")
 def adopt() -> None:
@@ -336,7 +319,7 @@ def adopt() -> None:
 
 
 @command(cli, "inspect")
-@click.argument("log", metavar="LOG")
+@argument("log", metavar="LOG")
 @table_layout
 def inspect() -> None:
     """Show what is in a log and guess its [log] table.
@@ -347,8 +330,8 @@ def inspect() -> None:
 
 
 @command(cli, "recover", workspace=False)
-@click.argument("log", metavar="LOG")
-@click.option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
+@argument("log", metavar="LOG")
+@option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
 def recover() -> None:
     """Recover what is readable in a damaged log.
 
@@ -357,28 +340,12 @@ def recover() -> None:
 
 
 @command(cli, "export")
-@click.argument("candidate", metavar="ID", required=False)
-@click.option(
-    "--format",
-    "form",
-    type=click.Choice(("csv", "npz", "json")),
-    help="Default: by the ending of FILE, without one json; of a trial csv.",
-)
-@click.option(
-    "-o",
-    "--output",
-    metavar="FILE",
-    help="Default: ID.FORMAT in the current folder, even with -C DIR; `next` writes into DIR.",
-)
-@flag(
-    "--runner", help="Write npz, and beside it grounded_runner.py, which runs it with numpy alone."
-)
+@argument("candidate", metavar="ID", required=False)
+@option("--format", "form", type=Choice(("csv", "npz", "json")), help="Default: by FILE's ending.")
+@option("-o", "--output", metavar="FILE", help="Default: ID.FORMAT in the current folder.")
+@flag("--runner", help="Write npz, and grounded_runner.py, which runs it with numpy alone.")
 @flag("--model", help="Write the model with the values found: MJCF, URDF or model.py.")
-@click.option(
-    "--library",
-    metavar="FILE.yaml",
-    help="Write what is known of one actuator; ID is its input (default: the only one).",
-)
+@option("--library", metavar="FILE.yaml", help="Write one actuator; ID is its input.")
 @anyway
 def export() -> None:
     """Write a candidate for the robot: csv, npz or json.
@@ -402,8 +369,8 @@ def verify() -> None:
 
 
 @command(cli, "demo", workspace=False)
-@click.argument("name", metavar="[NAME]", default="car-figure8")
-@click.option("--dir", "folder", metavar="DIR", help="Default: demo-NAME in the current folder.")
+@argument("name", metavar="[NAME]", default="car-figure8")
+@option("--dir", "folder", metavar="DIR", help="Default: demo-NAME in the current folder.")
 def demo() -> None:
     """Run a whole example in a new folder: learn, diagnose, report.
 
@@ -413,17 +380,15 @@ def demo() -> None:
 
 
 @command(cli, "experiment", workspace=False)
-@click.argument(
+@argument(
     "name",
-    type=click.Choice(("flight", "car", "footnote9", "theorem1")),
+    type=Choice(("flight", "car", "footnote9", "theorem1")),
     metavar="[NAME]",
     required=False,
 )
-@click.option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
+@option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
 @parallel("1")
-@click.option(
-    "--keep", metavar="DIR", help="Where finished jobs are kept (default: .grounded-studies/NAME)."
-)
+@option("--keep", metavar="DIR", help="Keeps finished jobs (.grounded-studies/NAME).")
 def experiment() -> None:
     """Reproduce the paper's studies.
 
@@ -440,33 +405,26 @@ def challenge() -> None:
     """
 
 
-labels = click.option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
+labels = option("--labels", metavar="DIR", help="Where the labels are (default: DIR-labels).")
 
 
 @command(challenge, "make", "challenge", workspace=False)
 @folder
-@click.option(
+@option(
     "--kind",
-    type=click.Choice(("single", "double", "none", "withheld")),
+    type=Choice(("single", "double", "none", "withheld")),
     required=True,
-    help="One effect, two, none, or one that is not in the library.",
+    help="How many effects; withheld: none of the library.",
 )
-@click.option("--cases", type=click.IntRange(1), required=True, metavar="N", help="How many.")
-@click.option(
-    "--seed", type=click.IntRange(0), required=True, metavar="S", help="Seed of all random draws."
-)
-@click.option(
-    "--systems",
-    default="own",
-    metavar="G1,G2",
-    help="Groups: own, kinked, mujoco (default: own; of several, own makes half of the cases).",
-)
+@option("--cases", type=IntRange(1), required=True, metavar="N", help="How many.")
+@option("--seed", type=IntRange(0), required=True, metavar="S", help="Of all draws.")
+@option("--systems", default="own", metavar="G1,G2", help="Of own, kinked, mujoco.")
 @labels
-@click.option(
+@option(
     "--param-error",
-    type=click.FloatRange(0.0, 0.5),
+    type=FloatRange(0.0, 0.5),
     metavar="E",
-    help="Relative error of the model's parameters, 0 to 0.5.",
+    help="Relative error of parameters, 0 to 0.5.",
 )
 def make_cases() -> None:
     """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
@@ -493,6 +451,6 @@ def score() -> None:
 
 
 @command(cli, "explain", workspace=False)
-@click.argument("name", metavar="[CODE|EFFECT]", required=False, default="")
+@argument("name", metavar="[CODE|EFFECT]", required=False, default="")
 def explain() -> None:
     """Say what the code of a finding, or an effect, means."""

@@ -9,13 +9,11 @@ from typing import Any
 
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found
-from grounded.model import Model
 from grounded_cli.console.options import json_asked, values_by_name
-from grounded_cli.console.terminal import field, number, progress, show, table, tell
+from grounded_cli.console.terminal import field, number, progress, show, tell
 from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.propose import tell_proposed
 from grounded_trials.logs.log_files import logs_in
-from grounded_trials.wording import extent, with_unit
 from grounded_trials.workspace.intake.ingest import Ingested
 from grounded_trials.workspace.looping import NextRun
 
@@ -40,7 +38,7 @@ def ingest(
             done.append(workspace.ingest(name, **about))
         if not json_asked():  # each at once, since the next one may be refused
             earlier = [note for one in done[:-1] for note in one.findings]
-            _tell(name, done[-1], workspace.base_model, details, earlier)
+            _tell(name, done[-1], details, earlier)
     yield {"trials": [one.to_json() for one in done]}
     show(f"\n{next_line(done[-1].then)}")
 
@@ -51,12 +49,10 @@ def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRu
     with progress(f"reading {log} and planning"):
         done = workspace.next(log, candidate=candidate)
     yield done
-    _tell(log, done.taken, workspace.base_model, details)
+    _tell(log, done.taken, details)
     if done.proposed is None:
-        first = found(
-            "search.discard_first", trial=done.taken.trial, candidate=done.taken.candidate
-        )
-        tell([first], all_=True)
+        about = {"trial": done.taken.trial, "candidate": done.taken.candidate}
+        tell([found("search.discard_first", **about)], all_=True)
         return show(next_line(done.taken.then))
     show("")
     tell_proposed(done.proposed)
@@ -69,9 +65,7 @@ def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRu
         show(next_line(NextCommand("next", ("LOG",))))
 
 
-def _tell(
-    name: str, one: Ingested, model: Model, details: bool, earlier: Sequence[Finding] = ()
-) -> None:
+def _tell(name: str, one: Ingested, details: bool, earlier: Sequence[Finding] = ()) -> None:
     """Print what became of a log; without details no note that was told of one before it."""
     if one.known:
         show(f"{name}: {one.trial}, stored before")
@@ -93,19 +87,3 @@ def _tell(
         show(field(one.candidate, text, "  "))
     if one.off_target:
         show(field("off target", "; ".join(each.finding.what for each in one.off_target), "  "))
-    if one.signals:
-        units = {**model.states, **model.inputs}
-        rows = [
-            (
-                s.name,
-                f"{s.rate_hz:.1f}",
-                f"{1e3 * s.jitter_s:.1f}",
-                f"{1e3 * s.largest_gap_s:.0f}",
-                "-" if s.skew_s is None else f"{1e3 * s.skew_s:.1f}",
-                str(s.bridged),
-                with_unit(" .. ".join(f"{v:.3g}" for v in extent(s.low, s.high)), units[s.name]),
-            )
-            for s in one.signals
-        ]
-        header = ("signal", "Hz", "jitter ms", "gap ms", "skew ms", "bridged", "range")
-        show(table(rows, header))

@@ -57,26 +57,19 @@ def _tell(topic: TopicReport) -> None:
 
 
 def _rows(fields: Sequence[FieldReport]) -> list[tuple[str, str, str]]:
-    """Return a row per field; the constants of one array (a covariance, say) share one row."""
-    arrays: dict[str, list[FieldReport]] = {}
-    for one in fields:
-        array = one.path.rpartition("[")[0]
-        if array and one.low is not None and one.low == one.high:
-            arrays.setdefault(array, []).append(one)
-    many = {array: same for array, same in arrays.items() if len(same) >= FOLDED_FIELDS}
-    folded = {one.path for same in many.values() for one in same}
+    """Return a row per field; constants of arrays (an IMU's covariance has 9) are counted."""
+    still = [
+        one for one in fields if "[" in one.path and one.low is not None and one.low == one.high
+    ]
+    folded = still if len(still) >= FOLDED_FIELDS else []
     rows = []
     for one in fields:
-        if one.path not in folded:
+        if one not in folded:
             low, high = one.low, one.high
             if low is not None and high is not None:
                 low, high = extent(low, high)
             rows.append((f"  {one.path}", number(low), number(high)))
-        elif same := many.pop(one.path.rpartition("[")[0], []):
-            values = [each.low for each in same if each.low is not None]
-            name = f"  {one.path.rpartition('[')[0]}[...], {len(same)} constants"
-            rows.append((name, number(min(values)), number(max(values))))
-    return rows
+    return [*rows, *[(f"  {len(folded)} constants of arrays", "", "")] * bool(folded)]
 
 
 def _what(found: Inspected) -> str:

@@ -1,7 +1,4 @@
-"""The body of a MuJoCo model for pictures: its visible geoms, moved by MuJoCo's kinematics.
-
-A body without geoms is drawn as the box of its inertia, with a rod from its joint.
-"""
+"""The body of a MuJoCo model for recordings: its visible geoms, moved by MuJoCo's kinematics."""
 
 from __future__ import annotations
 
@@ -16,14 +13,12 @@ from grounded.frozen import Array
 
 SHOWN = 3  # geom groups from here on are hidden, as in MuJoCo's viewer
 SPHERE, CAPSULE, ELLIPSOID, CYLINDER, BOX, MESH = 2, 3, 4, 5, 6, 7  # mjtGeom
-THIN = 0.012  # radius of a rod, as a fraction of the model's extent
-SMALLEST_EDGE = 1e-6  # [m] smallest half edge of a box
 
 
 class MujocoBody:
     """The body of a compiled model in a Model's coordinates."""
 
-    unit, watched = "m", "the last body's centre of mass"
+    unit = "m"
 
     def __init__(
         self,
@@ -38,16 +33,8 @@ class MujocoBody:
         self._kinematics = kinematics  # mj_kinematics
         shown = [g for g in range(compiled.ngeom) if _shown(compiled, g)]
         self._geoms = [g for g in shown if compiled.geom_type[g] in _SHAPES]
-        with_shape = {int(compiled.geom_bodyid[g]) for g in self._geoms}
+        self.parts = [_geom(compiled, g) for g in self._geoms]
         moving = [b for b in range(1, compiled.nbody) if compiled.body_mass[b] > 0]
-        self._bare = [b for b in moving if b not in with_shape]
-        small = [b for b in with_shape if _only_spheres(compiled, b)]
-        self._rods = [b for b in (*self._bare, *small) if np.linalg.norm(compiled.body_ipos[b]) > 0]
-        self.parts = [
-            *(_geom(compiled, g) for g in self._geoms),
-            *(_inertia(compiled, b) for b in self._bare),
-            *(_rod(compiled, b) for b in self._rods),
-        ]
         self._watched = moving[-1] if moving else 0
 
     def poses(self, states: Array) -> list[Pose]:
@@ -59,17 +46,15 @@ class MujocoBody:
             self._kinematics(compiled, data)
             frames.append(
                 [
-                    *((data.geom_xpos[g], data.geom_xmat[g]) for g in self._geoms),
-                    *((data.xipos[b], data.ximat[b]) for b in self._bare),
-                    *((data.xpos[b], self._along(b)) for b in self._rods),
+                    (data.geom_xpos[g].copy(), data.geom_xmat[g].reshape(3, 3).copy())
+                    for g in self._geoms
                 ]
             )
-            frames[-1] = [(np.array(x), np.array(m).reshape(3, 3)) for x, m in frames[-1]]
         found = []
         for k, part in enumerate(self.parts):
             turned = np.array([f[k][1] for f in frames]).reshape(-1, 3, 3)
             origin = np.array([f[k][0] for f in frames]).reshape(-1, 3)
-            if part.shape == "capsule" and k < len(self._geoms):  # MuJoCo's origin is the centre
+            if part.shape == "capsule":  # MuJoCo's origin is the centre
                 origin = origin - 0.5 * part.size[1] * turned[:, :, 2]
             found.append((origin, turned))
         return found
@@ -88,11 +73,6 @@ class MujocoBody:
         positions = self._whole(np.asarray(states, float))[:, : self._model.nv]
         return self._coordinates.to_qpos(positions)
 
-    def _along(self, body: int) -> Array:
-        """Return axes (3, 3) whose z points from a body's frame to its centre of mass."""
-        along = self._data.xipos[body] - self._data.xpos[body]
-        return _axes(along / np.linalg.norm(along))
-
 
 _SHAPES = {
     SPHERE: "ellipsoid",
@@ -106,11 +86,6 @@ _SHAPES = {
 
 def _shown(compiled: Any, geom: int) -> bool:
     return bool(compiled.geom_group[geom] < SHOWN and compiled.geom_rgba[geom][3] > 0)
-
-
-def _only_spheres(compiled: Any, body: int) -> bool:
-    geoms = [g for g in range(compiled.ngeom) if compiled.geom_bodyid[g] == body]
-    return all(compiled.geom_type[g] == SPHERE for g in geoms)
 
 
 def _geom(compiled: Any, geom: int) -> Part:
@@ -127,24 +102,3 @@ def _geom(compiled: Any, geom: int) -> Part:
     if kind in (CAPSULE, CYLINDER):
         return Part(name, shape, (size[0], 2 * size[1]))
     return Part(name, shape, (size[0], size[1], size[2]))
-
-
-def _inertia(compiled: Any, body: int) -> Part:
-    """Return the box with the body's mass and inertia."""
-    a, b, c = (float(v) for v in compiled.body_inertia[body])
-    mass = float(compiled.body_mass[body])
-    edges = [np.sqrt(max(1.5 * v / mass, 0.0)) for v in (b + c - a, a + c - b, a + b - c)]
-    return Part(f"body{body}", "box", tuple(max(float(e), SMALLEST_EDGE) for e in edges))
-
-
-def _rod(compiled: Any, body: int) -> Part:
-    length = float(np.linalg.norm(compiled.body_ipos[body]))
-    return Part(f"rod{body}", "capsule", (THIN * float(compiled.stat.extent), length))
-
-
-def _axes(along: Array) -> Array:
-    """Return a rotation matrix (3, 3) whose third column is the unit vector `along`."""
-    aside = np.eye(3)[int(np.argmin(np.abs(along)))]
-    first = np.cross(aside, along)
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(along, first), along], axis=1)

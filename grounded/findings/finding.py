@@ -69,11 +69,6 @@ class Finding:
         place = f"{self.facts['where']}: " if "where" in self.facts else ""
         return place + "; ".join(text for text in texts if text)
 
-    def knowing(self, facts: Mapping[str, Fact | None]) -> Finding:
-        """Return it with more facts; those that are None are left out."""
-        known = {name: value for name, value in facts.items() if value is not None}
-        return replace(self, facts={**self.facts, **known})
-
     @property
     def printable(self) -> bool:
         """Whether the catalogue has words for it: it may be from a document of another version."""
@@ -102,9 +97,10 @@ class Finding:
         """Return it with another weight."""
         return replace(self, weight=weight)
 
-    def also(self, **facts: Fact) -> Finding:
-        """Return it with further facts, or others in their place."""
-        return replace(self, facts={**self.facts, **facts})
+    def also(self, **facts: Fact | None) -> Finding:
+        """Return it with further facts, or others in their place; None is left out."""
+        known = {name: value for name, value in facts.items() if value is not None}
+        return replace(self, facts={**self.facts, **known})
 
     def to_json(self) -> dict[str, Any]:
         """Return its entry in the `findings` of a JSON document."""
@@ -154,7 +150,7 @@ def found(
 ) -> Finding:
     """Return a finding with the weight of its entry and the facts that are not None."""
     weighs = weight or Weight(entry_of(code).weight)
-    return Finding(code, about, {}, weighs, nats, then).knowing(facts)
+    return Finding(code, about, {}, weighs, nats, then).also(**facts)
 
 
 ORDER = list(Weight)  # the heaviest first

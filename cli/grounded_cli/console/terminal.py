@@ -115,13 +115,7 @@ def harmless(text: str, *, coloured: bool = False) -> str:
 
 def show_json(document: dict[str, Any]) -> None:
     """Write one JSON document to stdout, with null for NaN and infinities."""
-    text = json.dumps(plain(document), indent=1, ensure_ascii=False, allow_nan=False)
-    _write(re.sub(r"[^\n -~]", _escaped, text), _output())
-
-
-def _escaped(found: re.Match[str]) -> str:
-    """Return a character, JSON-escaped if a terminal might interpret it."""
-    return found[0] if found[0].isprintable() else json.dumps(found[0])[1:-1]
+    _write(json.dumps(plain(document), indent=1, allow_nan=False), _output())
 
 
 def lines(text: str, first: str, rest: str) -> list[str]:

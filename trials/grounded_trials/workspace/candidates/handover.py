@@ -328,7 +328,7 @@ class Check:
         for one in self.workspace.aside_trials():
             if one.trial.candidate == name:
                 told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
-                yield told.knowing({"why": aside[one.stored.id]})
+                yield told.also(why=aside[one.stored.id])
 
     def _too_long(self) -> Finding | None:
         """Return that the integrator's steps are too long for the model, if they are."""

@@ -166,7 +166,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     left = [] if told else _disowned(now, workspace.discarded())  # told when it was replaced
     if candidate is not None:
         notes = notes + left if not proposal.is_new else notes or left or changed
-        notes = [one.knowing({"instead": candidate.id}) for one in notes]
+        notes = [one.also(instead=candidate.id) for one in notes]
     first: list[Finding] = []
     if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.first_plan import left_open

@@ -191,10 +191,10 @@ def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) 
     }
     tried = {one.candidate.id for one in now.history}
     if best is None or made.id in tried or not math.isfinite(missed[-1]):
-        return found("plan.tested", made.id).knowing(facts)
+        return found("plan.tested", made.id).also(**facts)
     gain = made.promised_over(best)
     if made.way == "gentler gains" or not gain > 0:  # no model swings, so none tells its gain
-        return found("plan.tested", made.id).knowing(facts)
+        return found("plan.tested", made.id).also(**facts)
     noise = len(best.trials) == 1 and gain < replayed
     facts |= {"gain": gain, "less": int(gain < missed[-1]), "noise": int(noise)}
-    return found("plan.tested", made.id).knowing(facts)
+    return found("plan.tested", made.id).also(**facts)
