@@ -51,8 +51,8 @@ def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRu
     yield done
     _tell(log, done.taken, details)
     if done.proposed is None:
-        about = {"trial": done.taken.trial, "candidate": done.taken.candidate}
-        tell([found("search.discard_first", **about)], all_=True)
+        trial, ran = done.taken.trial, done.taken.candidate
+        tell([found("search.discard_first", trial=trial, candidate=ran)], all_=True)
         return show(next_line(done.taken.then))
     show("")
     tell_proposed(done.proposed)
