@@ -4,7 +4,8 @@ Read `improve.py` first: it makes one proposal of the paper's loop.
 
 ask_tell      the loop around the proposals
 standing      the state of the search, and why it ended
-certainty     which candidates improved, by `difference` (is one better, how sure) and `noise`
+difference    is one candidate better than another, by how much, how sure; which improved
+noise         of the sensors, and what it costs
 first_policy  the first policy: DDP from many starts, the first of them from `first_guess`
 making        builds a `candidate`: from a step, gentler gains, or the plan of a changed model
 planner       the model used for planning, with adopted effects

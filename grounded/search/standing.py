@@ -30,8 +30,7 @@ from grounded.figures.figure import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
-from grounded.search.certainty import judged
-from grounded.search.difference import LUCK, Difference, Starts, last_gain, missed_by_start
+from grounded.search.difference import LUCK, Difference, Starts, judged, last_gain, missed_by_start
 from grounded.search.pictures import search_figure
 from grounded.search.step.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task

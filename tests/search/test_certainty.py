@@ -7,8 +7,7 @@ import pytest
 from scipy.stats import ttest_ind
 
 from grounded.search.candidate import Tried
-from grounded.search.certainty import with_chance
-from grounded.search.difference import Difference, Repeats, in_question
+from grounded.search.difference import Difference, Repeats, in_question, with_chance
 
 
 def tried(*utilities, accepted=True, base="c0001"):

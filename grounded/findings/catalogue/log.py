@@ -111,7 +111,7 @@ ENTRIES: dict[str, Entry] = {
         "set scale = {by:.6g} in {table}, if so",
     ),
     "unread": Entry(
-        "warn",
+        "note",
         "{about} is in [log], but not in [estimate] measured: the trial has an estimate in its "
         "place",
         "to use it, add {about} = its scatter at standstill there",
@@ -219,9 +219,6 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "no candidate is waiting for a trial; its commands are those of {ran}, the best: it counts "
         "as another run of it",
-    ),
-    "elsewhere": Entry(
-        "note", "the {about} that it ran is from another workspace, or was made again since"
     ),
     "before": Entry(
         "note",

@@ -104,9 +104,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "limits_of_log": Entry(
         "note",
-        "[limits] are only the range used in {log}[[; {at} is at them for {share:%} of this plan]]",
-        "enter the robot's real limits, then delete seen_in there[[logged? ; draw the manoeuvre "
-        "(`target`): target.csv is the run in that log]]",
+        "[limits] are only the range used in {log}",
+        "enter the robot's real limits, then delete seen_in there",
     ),
     "falls_short": Entry(
         "note",

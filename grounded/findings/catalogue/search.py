@@ -104,13 +104,6 @@ ENTRIES: dict[str, Entry] = {
         "learn stops here, since the next plan would be based on this log",
         "fix it first, or run `learn` again if the warning is wrong",
     ),
-    # what a run changes
-    "counts": Entry(
-        "note",
-        "{about} counts as a run of {candidate} only because --candidate says so",
-        "[[aside? `{undo}`, unless it ran that; then `propose` goes on]][[!aside? to undo this: "
-        "`{undo}`]]",
-    ),
     # names
     "aside": Entry("refuse", "{about}[[, a run of {candidate},]] is set aside[[ ({why})]]"),
     "unknown": Entry(

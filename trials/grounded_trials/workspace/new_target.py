@@ -76,17 +76,6 @@ def logged_target(workspace: Folder) -> str:
     return ""
 
 
-def still_logged(workspace: Folder) -> bool:
-    """Return whether the target of a workspace made from a log is still the run in that log.
-
-    If that log was not ingested, there is no trial to compare with. Then the target is the log's
-    until `target` replaces it, which keeps the old one as .bak.
-    """
-    if any(not stored.trial.candidate for stored in workspace.whole_trials()):
-        return bool(logged_target(workspace))
-    return not (workspace.folder / f"{workspace.config.task.target}.bak").exists()
-
-
 def replace_target(
     config: Config,
     columns: Mapping[str, Array],

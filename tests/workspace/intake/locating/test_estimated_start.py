@@ -72,8 +72,7 @@ def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, bef
     k, stored = round(before * RATE) + 5 * np.arange(policy.horizon), w.trials()[-1].trial
     np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
     assert np.std(stored.states[:-1, 1] - table[k, 2]) > 0.3  # estimated all the same
-    told = bool(of_code(found, "log.unread"))
-    assert not told  # with the log before, see test_estimating.py
+    assert [one.about for one in of_code(found, "log.unread")] == [("v",)]
 
 
 def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after=1.0):

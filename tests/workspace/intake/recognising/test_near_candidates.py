@@ -8,7 +8,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from facts import of_code
 from grounded.accounts.returned import suspicion
 from grounded.accounts.sent import evidence, follows
 from grounded.trial import Trial
@@ -18,8 +17,8 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.opening.acted_on import acted_on
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
+from grounded_trials.workspace.intake.opening.run_start import acted_on
 from grounded_trials.workspace.intake.recognising.look import sender_of
 from recorded import follow
 from workspaces import CONFIG, make
@@ -200,18 +199,3 @@ def at_start(w, path, made):
     """A log, a candidate's policy, and where its run begins."""
     log = read_foreign(w, path, mapping_of(w, path)).recording
     return log, made.policy, log.start_of(made.policy).seconds
-
-
-def test_a_run_that_the_others_contradict_says_what_it_did(ladder, tmp_path):
-    w = make(tmp_path / "w", config=NOISY)
-    first = propose_in(w).candidate.id
-    for _ in range(3):
-        done = ingest_log(w, run_candidate(w, first).trial_file, first)
-        assert not of_code(done, "search.counts")
-    runs = [one.trial for one in w.trials()]
-    states = runs[0].states + np.linspace(0, 0.5, 41)[:, None]
-    strange = replace(runs[0], states=states, inputs=runs[0].inputs[::-1])
-    write_trial(tmp_path / "a.mcap", strange, {"kind": "trial", "task": w.task.hash})
-    done = ingest_log(w, tmp_path / "a.mcap", first)
-    (note,) = of_code(done, "search.counts")
-    assert first in note.sentence and f"discard {done.trial}" in note.sentence

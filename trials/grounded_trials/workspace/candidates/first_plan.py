@@ -20,7 +20,6 @@ from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded_trials.workspace.candidates.at_rest import held_before
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.new_target import still_logged
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
 from grounded_trials.workspace.user_files.task_file import seen_in
 
@@ -121,17 +120,8 @@ def without_effect(plan: Plan) -> Iterator[Finding]:
 
 def limits_of_log(plan: Plan) -> Iterator[Finding]:
     """[limits] are only what a log used."""
-    if not (log := seen_in(plan.workspace.config)):
-        return
-    shares = {"": 0.0} if plan.made is None else plan.at_limits(plan.made)
-    at = max(shares, key=lambda name: shares[name])
-    yield found(
-        "plan.limits_of_log",
-        log=log,
-        at=at if shares[at] else None,
-        share=shares[at],
-        logged=int(still_logged(plan.workspace)),
-    )
+    if log := seen_in(plan.workspace.config):
+        yield found("plan.limits_of_log", log=log)
 
 
 def off_target(plan: Plan) -> Iterator[Finding]:

@@ -24,13 +24,12 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, standing
-from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.identity import other_task
 from grounded_trials.workspace.last_diagnosis import readable_diagnosis, since_diagnosis
 
 if TYPE_CHECKING:
-    from grounded.search.candidate import Candidate, Tried
+    from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal
 
 KIND = ".ended"
@@ -229,29 +228,3 @@ def latest_candidates(workspace: Folder, most: int) -> tuple[list[Candidate], li
             candidate, meta = workspace.candidate(identity)
             found[meta.get("task") != workspace.task.hash].append(candidate)
     return found
-
-
-def odd_run(
-    workspace: Folder, now: Standing, identity: str, *, aside: bool = False
-) -> tuple[Finding, ...]:
-    """Return that a doubted run counts, and how to undo that.
-
-    Args:
-        workspace: the workspace with the trials.
-        now: the standing of the search including the run.
-        identity: the run's id, such as t0011.
-        aside: whether it is to be set aside unless the user goes on with it.
-    """
-    after = _of(now, identity)
-    if after is None:
-        return ()
-    then = NextCommand("discard", (identity,))
-    undo, name = rendered(then, workspace.address), after.candidate.id
-    one = found("search.counts", identity, then=then, candidate=name, undo=undo, aside=int(aside))
-    return (one,)
-
-
-def _of(now: Standing, identity: str) -> Tried | None:
-    """Return the candidate that a run is averaged into."""
-    runs = ((tried, [trial.id for trial in tried.trials]) for tried in now.history)
-    return next((tried for tried, ids in runs if identity in ids), None)

@@ -32,7 +32,6 @@ from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
-    odd_run,
     overtaken,
     standing_in,
     standing_of,
@@ -259,8 +258,6 @@ class Stored:
             yield read.before.finding(used=not self.aside)
         if self.now and (changed := overtaken(here, ran=True)):
             yield changed.weighing(Weight.WARN)
-        if self.now and read.doubted and not self.aside:
-            yield from odd_run(here, self.now, self.id, aside=read.to_set_aside is not None)
         whole = interpolate_gaps(trial).trial
         yield from log_faults(here, whole, own=read.own)
         yield begun_elsewhere(here, trial)

@@ -4,5 +4,5 @@ Read `reading.py` first: a trial written by grounded must belong to this workspa
 read by `foreign.py` through [log]; `estimating.py` finds its unmeasured states, and
 `columns_by_name.py` columns whose names say something else. `stored_before.py` finds whether a log
 is stored already. `run_start.py` finds where a candidate's run begins in a log, on the samples that
-the robot's program had when it sent a command (`acted_on.py`).
+the robot's program had when it sent a command.
 """

@@ -5,7 +5,6 @@ States that are not measured are estimated along the whole log, see `estimating`
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -33,7 +32,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
     INTERPOLATED,
-    READ_BY,
     ROWS,
     StoredTrial,
 )
@@ -194,22 +192,8 @@ class ForeignLog:
 
     @property
     def unread(self) -> tuple[Finding, ...]:
-        """Such states, which only identify a run, while its trial has estimates.
-
-        That is so by the set-up, so it is told of the first log that was read like this.
-        """
-        known = [
-            one.meta
-            for one in self.workspace.whole_trials()
-            if READ_BY in one.meta and one.meta.get("source_sha256") != self.source["source_sha256"]
-        ]
-        last = known[-1] if known else {}
-        guessed, columns = last.get("estimated", "").split(","), last.get(READ_BY, "")
-        return tuple(
-            found("log.unread", name)
-            for name in self._beside
-            if name not in guessed or f"{json.dumps(name)}:" not in columns
-        )
+        """Such states, which only identify a run, while its trial has estimates."""
+        return tuple(found("log.unread", name) for name in self._beside)
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError
-from grounded.findings import Finding, Weight, found
+from grounded.findings import Finding, Weight
 from grounded.trial import Trial
 from grounded.units import same_unit
 from grounded_trials.plain_file import read_file
@@ -102,9 +102,8 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         kept = ("system", "source", "source_sha256", "estimated", ESTIMATED_WITH, READ_BY)
         kept_of = {k: v for k, v in meta.items() if k in kept}
         kept_of |= {"kind": "data", "ran": trial.candidate}
-        some = _elsewhere(workspace, trial.candidate, policy)
         trial = replace(trial, candidate="")
-        return Read(trial, encode(workspace, trial, kept_of), some)
+        return Read(trial, encode(workspace, trial, kept_of))
     if candidate is not None and trial.candidate not in ("", candidate):
         raise refused("log.another", log=str(path), ran=candidate, other=trial.candidate)
     if trial.candidate:
@@ -122,14 +121,6 @@ def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
         for name, unit in json.loads(meta[kind]).items():
             if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
                 yield f"{name} [{unit}, not {own[name]}]"
-
-
-def _elsewhere(workspace: Folder, candidate: str, policy: bytes | None) -> tuple[Finding, ...]:
-    """Return that the policy in a trial is not this workspace's candidate, if so."""
-    known = candidate in workspace.candidate_ids()
-    if policy is None or (known and policy == workspace.candidate_bytes(candidate)):
-        return ()
-    return (found("log.elsewhere", candidate),)
 
 
 def check_candidate(

@@ -31,8 +31,7 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.workspace.intake.opening.acted_on import ActedOn, acted_on
-from grounded_trials.workspace.intake.opening.run_start import Recording, Start
+from grounded_trials.workspace.intake.opening.run_start import ActedOn, Recording, Start, acted_on
 
 LOOSE = 0.1  # uncertainty of a start, in steps, above which it is another, or is told
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
