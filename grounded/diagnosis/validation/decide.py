@@ -11,8 +11,7 @@ A guard refuses a cause whatever it gains:
     cut        beside it, a parameter of the model ends at a bound at which it is not without it:
                the bound decides how large the cause is
     no size    none of its values differs from zero by SURE standard deviations
-    one group  only one of several groups of trials shows it, or all trials are of one group and
-               it names no mechanism (`Family.loose`)
+    one group  it names no mechanism (`Family.loose`), and one group of trials alone shows it
     refuted    it limits a rate that the log exceeds, or that no command reaches (`no_limits`)
 """
 
@@ -275,18 +274,17 @@ def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
 
 
 def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> tuple[int, ...]:
-    """Return the trials of the only group that shows an effect; none if several do.
+    """Return the trials of the only group that shows an effect without a mechanism; or none.
 
-    By the trials outside that group, it has no size. Where all trials are of one group, no effect
-    can be asked for a second one but those that name no mechanism: along one motion, any error of
-    the model is the same function of time and of every state, and each repeat raises the evidence
-    of an effect that fits it. (Of a single log, its pieces are the groups.)
+    By the trials outside that group, it has no size. Along one motion, any error of the model is
+    the same function of time and of every state, and each repeat raises the evidence of an effect
+    that fits it. (Of a single log, its pieces are the groups.) A mechanism is asked by the ruler
+    alone, which predicts each group without it.
     """
     data, h, worth = search.data, fit.hypothesis, search.tempering.factor
     i = h.names.index(name)
     family, own = h.effects[i].family, h.sizes[i]
-    several = len(data.groups) > 1 and not isinstance(family, ParamFamily)
-    if not (family.loose or several):
+    if not family.loose:
         return ()
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]
     for g, shift in zip(np.unique(group), leave_one_out(fit, group), strict=True):
