@@ -11,7 +11,8 @@ A guard refuses a cause whatever it gains:
     cut        beside it, a parameter of the model ends at a bound at which it is not without it:
                the bound decides how large the cause is
     no size    none of its values differs from zero by SURE standard deviations
-    one group  it names no mechanism (`Family.loose`), and one group of trials alone shows it
+    one group  only one of several groups of trials shows it, or all trials are of one group and
+               it names no mechanism (`Family.loose`)
     refuted    it limits a rate that the log exceeds, or that no command reaches (`no_limits`)
 """
 
@@ -274,17 +275,18 @@ def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
 
 
 def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> tuple[int, ...]:
-    """Return the trials of the only group that shows an effect without a mechanism; or none.
+    """Return the trials of the only group that shows an effect; none if several do.
 
-    By the trials outside that group, it has no size. Along one motion, any error of the model is
-    the same function of time and of every state, and each repeat raises the evidence of an effect
-    that fits it. (Of a single log, its pieces are the groups.) A mechanism is asked by the ruler
-    alone, which predicts each group without it.
+    By the trials outside that group, it has no size. Where all trials are of one group, no effect
+    can be asked for a second one but those that name no mechanism: along one motion, any error of
+    the model is the same function of time and of every state, and each repeat raises the evidence
+    of an effect that fits it. (Of a single log, its pieces are the groups.)
     """
     data, h, worth = search.data, fit.hypothesis, search.tempering.factor
     i = h.names.index(name)
     family, own = h.effects[i].family, h.sizes[i]
-    if not family.loose:
+    several = len(data.groups) > 1 and not isinstance(family, ParamFamily)
+    if not (family.loose or several):
         return ()
     group = data.folds if data.count == 1 else data.group_of[data.trial_of]
     for g, shift in zip(np.unique(group), leave_one_out(fit, group), strict=True):
