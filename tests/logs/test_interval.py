@@ -71,7 +71,3 @@ def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(t
     assert found.dt == dt
     assert 'seen_in = "r.csv"' in (tmp_path / "w/grounded.toml").read_text()
     assert bool(of_code(found, "start.interval")) == (every == 5)
-    given = begin(tmp_path / "g", tmp_path / "r.csv", model=tmp_path / "m.py", dt=0.02)
-    told = of_code(given, "start.interval")
-    assert given.dt == 0.02 and len(told) == (every == 1)  # else each command has its steps
-    assert all(one.facts["every"] == 0.01 and one.facts["dt"] == 0.02 for one in told)

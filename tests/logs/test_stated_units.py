@@ -1,7 +1,5 @@
 """A log that says mm beside a model in metres was taken in as metres, a thousand times too far."""
 
-import tomllib
-
 import numpy as np
 import pytest
 
@@ -138,46 +136,6 @@ def test_names_and_heads_make_scales_and_a_rate_is_compared_after_them(tmp_path,
         n: pytest.approx(factors.get(n, 1.0)) for n in found
     }
     assert all(one["sure"] for one in found.values())
-
-
-ROLLING = """from grounded import Model, Param
-model = Model(
-    states={"pitch": "rad", "yaw": "rad", "pitch_rate": "rad/s", "yaw_rate": "rad/s"},
-    inputs={"u_pitch": "V", "u_yaw": "V"}, params={},
-    derivative=lambda s, a, p: {"pitch": s.pitch_rate, "yaw": s.yaw_rate,
-        "pitch_rate": 2 * a.u_pitch - s.pitch, "yaw_rate": 3 * a.u_yaw - s.yaw_rate})
-"""
-
-
-def helicopter(folder, names, linked=True):
-    """A workspace for a log in degrees with these names, and its [log] table."""
-    t = np.arange(0, 12, 0.05)
-    pitch, yaw = 20 * np.sin(0.9 * t), 30 * np.sin(0.5 * t + 1)
-    rates = [np.gradient(angle, t) if linked else angle**2 for angle in (pitch, yaw)]
-    rows = np.column_stack([t, pitch, yaw, *rates, np.cos(0.9 * t), np.cos(0.5 * t)])
-    np.savetxt(folder / "a.csv", rows, "%.5f", ";", header=";".join(["t", *names]), comments="")
-    (folder / "m.py").write_text(ROLLING)
-    files = ("--from", folder / "a.csv", "--model", folder / "m.py")
-    made = grounded("init", folder / "w", *files)
-    assert made.code == 0, made.err
-    return made.out, (folder / "w" / "grounded.toml").read_text()
-
-
-@pytest.mark.parametrize(
-    "names",
-    [
-        "Nickwinkel_deg Gierwinkel_deg Nickrate_dps Gierwinkelgeschwindigkeit_dps U_Nick U_Gier",
-        "tangage_deg lacet_deg vitesse_tangage_dps lacet_rate_dps u_tangage u_lacet",
-    ],
-)
-def test_names_in_other_languages_are_found_with_their_units(tmp_path, names):
-    names = names.split()
-    out, text = helicopter(tmp_path, names)
-    assert "UNSURE" not in out
-    log = tomllib.loads(text)["log"]
-    signals = {**log["state"], **log["input"]}
-    assert [one["path"] for one in signals.values()] == [f"/csv.{name}" for name in names]
-    assert [one["scale"] for one in log["state"].values()] == [pytest.approx(np.pi / 180)] * 4
 
 
 TURNED = """import numpy as np

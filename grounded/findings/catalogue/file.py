@@ -79,8 +79,7 @@ ENTRIES: dict[str, Entry] = {
     # files and folders
     "missing": Entry(
         "refuse",
-        "{about} does not exist[[, nor does its folder {folder}]][[: did you mean '{near}'?]]"
-        "[[: the newest of {logs:log} there {newest:is/are} {newest}]]",
+        "{about} does not exist[[, nor does its folder {folder}]][[: did you mean '{near}'?]]",
     ),
     "no_workspace": Entry(
         "refuse",

@@ -31,7 +31,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
 KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".bin", ".mat", ".parquet")
-NEWEST = 3  # most logs named in place of one that does not exist
+NAMED = 3  # most tables named of a folder that is no log
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
 _LISTED = re.compile(
@@ -114,7 +114,7 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
             if inside == [path]:
                 workspace = int((path / "grounded.toml").is_file())
                 tables = () if workspace else sorted(p.name for p in _listed(path))
-                several = tuple(n for n in tables if n.endswith(".csv"))[:NEWEST]
+                several = tuple(n for n in tables if n.endswith(".csv"))[:NAMED]
                 facts: dict[str, Any] = {"tables": several} if len(several) > 1 else {}
                 raise GroundedError(found("file.no_log", str(path), own=workspace, **facts))
             files.extend(inside)
@@ -169,17 +169,13 @@ def _is_none(path: Path) -> bool:
 
 
 def _missing(path: Path) -> GroundedError:
-    """Return the error for a file that does not exist, with the logs that it may stand for."""
+    """Return the error for a file that does not exist, with the log that it may stand for."""
     if not path.parent.is_dir():
         return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
-    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and p.exists()]
-    logs = sorted((p for p in there if not _is_none(p)), key=lambda p: -p.stat().st_mtime)
-    named = {p.stem: p.name for p in reversed(logs)}  # endings make all names alike
+    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and not _is_none(p)]
+    named = {p.stem: p.name for p in sorted(there)}  # endings make all names alike
     close = named.get(alike(path.stem, named), "")
-    newest = () if close else tuple(p.name for p in logs[:NEWEST])
-    return GroundedError(
-        found("file.missing", str(path), near=close, newest=newest, logs=len(logs) * (not close))
-    )
+    return GroundedError(found("file.missing", str(path), near=close))
 
 
 def _unreadable(path: Path, why: str, kind: str = "") -> GroundedError:

@@ -36,7 +36,7 @@ from grounded_trials.logs.stated_units import Stated
 from grounded_trials.plain_file import unreadable
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
-from grounded_trials.starting.interval import interval_of, too_coarse
+from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import (
     KINDS,
     Clues,
@@ -189,10 +189,7 @@ def begin(
         slow = () if layout.rate or about_table(logs[0]).in_time_units else _in_seconds(report)
 
         # The control interval, and the ranges: zero is sent after a run, so limits must include it.
-        if dt:
-            step, note = dt, too_coarse(report, commands, dt)
-        else:
-            step, note = interval_of(report, commands, states)
+        step, note = (dt, ()) if dt else interval_of(report, commands, states)
         made = own.in_step(folder, drawn.model, step) if own else drawn.model
         ranges = {g.name: g.extent for g in (*states, *commands)}
         for g in commands if drawn.kind != "drone" else ():

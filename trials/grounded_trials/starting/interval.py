@@ -75,20 +75,6 @@ def round_interval(rows: float) -> float:
     return float(f"{nearest if abs(nearest / rows - 1) < ROUNDING else rows:.6g}")
 
 
-def too_coarse(report: LogReport, inputs: Sequence[Guess], dt: float) -> tuple[Finding, ...]:
-    """Return a note if the commands of a log change more than once in a given interval.
-
-    Args:
-        report: the log.
-        inputs: the paths of its commands.
-        dt: the interval that the user asked for [s].
-    """
-    gaps = _gaps(report, _commanded(inputs))
-    if len(gaps) < FEWEST_TIMES or dt < APART * (apart := float(np.median(gaps))):
-        return ()
-    return (found("start.interval", every=round_interval(apart), dt=dt),)
-
-
 def _gaps(report: LogReport, inputs: Sequence[Guess]) -> Array:
     """Return the times between changes of a log's commands [s]; none if they can't be read."""
     specs = {g.name: SignalSpec(g.path, clock=g.clock) for g in inputs if g.path}  # type: ignore[arg-type]

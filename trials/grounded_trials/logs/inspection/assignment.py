@@ -200,8 +200,6 @@ class _Table:
         """Return the points of a name, fewer for numbers that tell little; 0 if none fits."""
         topic, one = number.topic, number.field
         points = words.name_points(called, role.name, topic, one, is_input=role.sent)
-        if not points and not role.sent and number.moves:
-            points = words.STEM * words.is_stem(role.name, role.unit, number.path)
         if not points:
             return 0.0
         self.named.add((role.name, number.path))

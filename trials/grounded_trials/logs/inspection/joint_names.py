@@ -11,15 +11,11 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from grounded.findings import Finding, found
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.stated_units import SLIDING, TURNING
-
-if TYPE_CHECKING:
-    pass
 
 AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
 PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}

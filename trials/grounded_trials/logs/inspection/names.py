@@ -5,13 +5,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 
-from grounded.units import factor_between
 from grounded_trials.formats.message_path import AXES, WORLD
 from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
 from grounded_trials.logs.stated_units import (
     bare_command,
-    in_english,
-    unit_in_name,
     without_role,
     without_unit,
 )
@@ -77,8 +74,7 @@ POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 _WORD = re.compile(r"[a-z]+")
 _FLAT = re.compile(r"_(linear|angular)_(?=[xyz]$)")  # a Twist in a table: cmd_vel_linear_x
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
-_RATE = re.compile(r"_(rate|speed|velocity|vel|omega|dot)$")
-WORTH, LESS, TOPIC, STEM = 4.0, 0.3, 3.0, 3.0  # points of the usual name, less of each further one
+WORTH, LESS, TOPIC = 4.0, 0.3, 3.0  # points of the usual name, less of each further one
 
 
 def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) -> tuple[str, ...]:
@@ -115,7 +111,7 @@ def name_points(
     inside, apart = (one.lower().strip('".') for one in (rest, _HUMP.sub("_", rest)))
     plain = bare_command if is_input else without_unit
     bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
-    ways = {inside, bare, apart, in_english(inside), in_english(bare), _FLAT.sub(r".\1.", inside)}
+    ways = {inside, bare, apart, _FLAT.sub(r".\1.", inside)}
     best = max(_fit(called, one, topic.topic.lower()) for one in ways)
     folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
     if is_input and inside in ("data", "value") and {*called} & {*folders}:
@@ -126,20 +122,9 @@ def name_points(
         best = max((_fit(usual, one, topic.topic.lower()) for one in ways), default=0.0)
     if best <= 0:
         return 0.0
-    words = {*_WORD.findall(field.path.lower()), *_WORD.findall(in_english(inside))}
+    words = {*_WORD.findall(field.path.lower())}
     commanded = any(word in words for word in _COMMANDED)
     return best + (0.5 if is_input else -2.0) * commanded + 0.5 * (topic.stamped and not is_input)
-
-
-def is_stem(name: str, unit: str, path: str) -> bool:
-    """Return whether a state's name begins like a number in its kind of unit.
-
-    So `wheel_rpm` is the state wheel_speed [rad/s].
-    """
-    stem = _RATE.sub("", name.lower())
-    last = re.split(r"[/.]", without_unit(path).lower())[-1].strip('"')
-    known = stem != name.lower() and unit not in ("", "1") and last == stem
-    return known and factor_between(unit_in_name(path), unit) is not None
 
 
 def has_words(path: str, name: str) -> bool:
@@ -148,7 +133,7 @@ def has_words(path: str, name: str) -> bool:
     So `voltage` is `motor_voltage`, but not `voltage_rate`.
     """
     last = re.split(r"[./]", path.lower())[-1]
-    said = {*_WORD.findall(last), *_WORD.findall(in_english(last))}
+    said = {*_WORD.findall(last)}
     words = {*_WORD.findall(name.lower())}
     long = bool(words) and all(len(word) > 1 for word in words)
     return long and words <= said and not (said - words) & _RATES
