@@ -370,7 +370,7 @@ def fault_injection(stride: int = 1) -> Outcome | None:
                 if b"0 first" not in kept or (done.stdout == "added\n" and len(kept) != 2):
                     failures.append(f"{where}: lost")
                 again = store.add(b"1 " + bytes(300_000))
-                if store.read(again.sha256) != b"1 " + bytes(300_000) or len(store.list()) != 2:
+                if store.read(again.path.name) != b"1 " + bytes(300_000) or len(store.list()) != 2:
                     failures.append(f"{where}: the next add failed")
                 if list(Path(folder).glob("*.tmp")) + list(Path(folder).glob(".*.tmp")):
                     failures.append(f"{where}: a temporary file stays")

@@ -110,9 +110,7 @@ class Store:
         return {entry.digest for entry in self.list()}
 
     def find(self, key: str) -> Stored:
-        """Return the file whose short name or name is `key`, or whose hash starts with it.
-
-        A part of a hash needs at least 4 digits.
+        """Return the file whose short name or name is `key`.
 
         Raises:
             GroundedError: if there is none, or more than one.
@@ -127,11 +125,7 @@ class Store:
 
     def matching(self, key: str) -> tuple[Stored, ...]:
         """Return the files that `find` chooses from."""
-        entries = self.list()
-        hits = tuple(s for s in entries if key in (s.id, s.path.name))
-        if not hits and len(key) >= 4:
-            return tuple(s for s in entries if s.digest.startswith(key[:DIGITS]))
-        return hits
+        return tuple(s for s in self.list() if key in (s.id, s.path.name))
 
     def read(self, key: str | Stored) -> bytes:
         """Return the contents of a file, checked against its hash.

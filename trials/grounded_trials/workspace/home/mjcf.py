@@ -9,7 +9,7 @@ A body whose mass follows from its geoms gets an `inertial` element.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,34 +54,25 @@ class Mjcf:
         self._includes = dict[Path, Element]()  # the element that names each included file
         self.main = self._read(path)
         tops = list(self._inside(self.main.root))
-        self.worlds = [one for one in tops if one.tag == "worldbody"]
-        self.bodies = [one for world in self.worlds for one in self._bodies(world)]
         groups = (self._inside(one) for one in tops if one.tag == "actuator")
         self.actuators = [one for group in groups for one in group]
+        self._read_all(tops)
 
     def element(self, kind: str, index: int) -> Element | None:
         """Return the element of a body, joint, geom or actuator of the compiled model.
 
-        None if the file makes its elements in another way (replicate, attach).
+        It is found by its name, an actuator without one by its place. None if the file makes its
+        elements in another way (replicate, attach), or does not name them.
         """
-        model = self.compiled
+        name = getattr(self.compiled, kind)(index).name
         if kind == "actuator":
-            found, name = self.actuators, model.actuator(index).name
-        elif kind == "body":
-            found, name, index = self.bodies, model.body(index).name, index - 1
+            found = self.actuators
         else:
-            body = int(getattr(model, "jnt_bodyid" if kind == "joint" else "geom_bodyid")[index])
-            inside = self.worlds if body == 0 else self.bodies[body - 1 : body]
-            tags = ("joint", "freejoint") if kind == "joint" else ("geom",)
-            found = [one for each in inside for one in self._inside(each) if one.tag in tags]
-            first = model.body_jntadr if kind == "joint" else model.body_geomadr
-            name = getattr(model, kind)(index).name
-            index -= int(first[body])
-        named = [one for one in found if name and one.get("name", "") == name]
-        if named:
-            return named[0]
-        one = found[index] if 0 <= index < len(found) else None
-        return None if one is None or one.get("name", "") != name else one
+            found = [one for text in self.texts.values() for one in text.root.iter(kind)]
+        if name:
+            return next((one for one in found if one.get("name") == name), None)
+        one = found[index] if kind == "actuator" and index < len(found) else None
+        return None if one is None or one.get("name") else one
 
     def write(self, numbers: Sequence[Number]) -> list[Number]:
         """Write numbers into the text; return those that have no place in it."""
@@ -120,12 +111,10 @@ class Mjcf:
             else:
                 yield one
 
-    def _bodies(self, element: Element) -> Iterator[Element]:
-        """Yield bodies in the order of MjModel: each before those in it."""
-        for one in self._inside(element):
-            if one.tag == "body":
-                yield one
-                yield from self._bodies(one)
+    def _read_all(self, elements: Iterable[Element]) -> None:
+        """Read the files that are included anywhere in some elements."""
+        for one in elements:
+            self._read_all(self._inside(one))
 
     def _write(self, number: Number) -> bool:
         element = self.element(number.kind, number.index)
