@@ -388,12 +388,10 @@ def demo() -> None:
 )
 @option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
 @parallel("1")
-@option("--keep", metavar="DIR", help="Keeps finished jobs (.grounded-studies/NAME).")
 def experiment() -> None:
     """Reproduce the paper's studies.
 
     The same seeds give the same results on any machine. Without NAME the studies are listed.
-    Finished jobs are kept, so an interrupted study resumes.
     """
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import click
@@ -13,7 +12,6 @@ from grounded.experiments import car, flight, footnote9, theorem1
 from grounded.refusals import wrong
 from grounded_cli.console.options import misuse
 from grounded_cli.console.terminal import bar, show, table
-from grounded_trials.store.documents import StudyStore
 
 # name -> (function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
 STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
@@ -24,9 +22,7 @@ STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
 }
 
 
-def experiment(
-    name: str | None, seeds: str | None, jobs: int | None, keep: str | None
-) -> Iterator[Any]:
+def experiment(name: str | None, seeds: str | None, jobs: int | None) -> Iterator[Any]:
     """Run a study, or list all."""
     if name is None:
         yield {"studies": {key: text for key, (_, _, text) in STUDIES.items()}}
@@ -35,8 +31,7 @@ def experiment(
     given: dict[str, Any] = _seeds(seeds, kind, name)
     with bar(name) as progress:
         if kind:
-            kept = StudyStore(Path(keep or f".grounded-studies/{name}"))
-            given |= {"engine": Engine(jobs or 1), "finished": kept, "progress": progress}
+            given |= {"engine": Engine(jobs or 1), "progress": progress}
         result = study(**given)
     yield result
     for one in result.tables():

@@ -2,12 +2,7 @@
 
 A job is a module-level function called with plain numbers and names, and returns plain JSON values.
 It draws all random numbers from its own seed, so the same seeds give the same results bit for bit
-on one worker or on fifty. `grounded.engine` decides where jobs run.
-
-    finished    a mapping from a job's key to its result; jobs found in it are not run again. The
-                caller may keep it on disk, so that an interrupted study can be continued. The key
-                contains a hash of the sources, so that results of two versions are never mixed.
-    lost worker it ends the study, and running it again goes on from what is finished.
+on one worker or on fifty. `grounded.engine` decides where jobs run; a lost worker ends the study.
 
 The module also has the statistics that studies report: means with standard errors, improvements,
 slopes, tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so
@@ -17,15 +12,12 @@ ratios or a ratio of means; both are given.
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, MutableMapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
-from pathlib import Path
 from typing import Any, TypedDict, TypeVar, Unpack
 
 import numpy as np
@@ -37,16 +29,6 @@ Progress = Callable[[int, int], None]  # jobs done, jobs in all
 R = TypeVar("R")
 
 
-@cache
-def code() -> str:
-    """Return a hash of this package's sources, since results depend on them."""
-    digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
-    for path in sorted(root.rglob("*.py")):
-        digest.update(path.relative_to(root).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
 @dataclass(frozen=True)
 class Job:
     """One call of a module-level function with JSON-like arguments."""
@@ -54,18 +36,11 @@ class Job:
     function: Callable[..., dict[str, Any]]
     arguments: dict[str, Any]
 
-    @property
-    def key(self) -> str:
-        """Key of its result: a hash of the code, the function's name and its arguments."""
-        name = f"{code()} {self.function.__module__}.{self.function.__name__}"
-        return f"{name}:{json.dumps(self.arguments, sort_keys=True)}"
-
 
 class Running(TypedDict, total=False):
     """How a study runs its jobs: the keyword arguments of `run_jobs`."""
 
     engine: Engine | None
-    finished: MutableMapping[str, dict[str, Any]] | None
     progress: Progress | None
 
 
@@ -73,7 +48,6 @@ def run_jobs(
     jobs: Sequence[Job],
     engine: Engine | None = None,
     *,
-    finished: MutableMapping[str, dict[str, Any]] | None = None,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
     """Run jobs and return their results in the same order.
@@ -81,31 +55,22 @@ def run_jobs(
     Args:
         jobs: the jobs.
         engine: where they run; None: in this process.
-        finished: results by `Job.key`; read first, and filled as jobs end.
         progress: called with the number of jobs done and the total.
 
     Raises:
         GroundedError: if a worker dies.
     """
-    engine, finished = engine or Engine(), {} if finished is None else finished
-    results = {job.key: finished[job.key] for job in jobs if job.key in finished}
-    waiting = list({job.key: job for job in jobs if job.key not in results}.values())
-    total = len(results) + len(waiting)
-
-    def keep(key: str, result: dict[str, Any]) -> None:
-        finished[key] = results[key] = result
-        if progress:
-            progress(len(results), total)
-
-    if progress:
-        progress(len(results), total)
+    results, total = dict[int, dict[str, Any]](), len(jobs)
+    tell = progress or (lambda done, total: None)
+    tell(0, total)
     try:
-        for key, result in processes(engine, _call, waiting):
-            keep(key, result)
+        for i, result in processes(engine or Engine(), _call, [*enumerate(jobs)]):
+            results[i] = result
+            tell(len(results), total)
     except BrokenProcessPool as error:
         undone = total - len(results)
         raise refused("run.workers", lost=undone, total=total, why=str(error)) from None
-    return [results[job.key] for job in jobs]
+    return [results[i] for i in range(total)]
 
 
 def every(**axes: Iterable[Any]) -> list[dict[str, Any]]:
@@ -132,9 +97,10 @@ def run_study(
     return tuple(kind(**result) for result in tuples)
 
 
-def _call(job: Job) -> tuple[str, dict[str, Any]]:
-    # through JSON and back, so that new results equal those read from disk
-    return job.key, json.loads(json.dumps(job.function(**job.arguments)))
+def _call(row: tuple[int, Job]) -> tuple[int, dict[str, Any]]:
+    # through JSON and back: results are plain values
+    i, job = row
+    return i, json.loads(json.dumps(job.function(**job.arguments)))
 
 
 @dataclass(frozen=True)

@@ -19,30 +19,12 @@ def test_any_number_of_workers_gives_the_same_bits():
     assert [result["seed"] for result in alone] == list(range(6))
 
 
-def test_finished_jobs_are_kept_and_not_run_again():
-    kept = {}
-    first = run_jobs(draws(3), finished=kept)
-    assert len(kept) == 3
-    kept[draws(1)[0].key] = {"seed": 0, "value": "kept"}
-    seen = []
-    again = run_jobs(
-        draws(5), finished=kept, progress=lambda done, total: seen.append((done, total))
-    )
-    assert again[0] == {"seed": 0, "value": "kept"}
-    assert again[1:3] == first[1:]
-    assert seen == [(3, 5), (4, 5), (5, 5)]
-
-
 @pytest.mark.slow
-def test_a_lost_worker_ends_a_study_that_goes_on_from_what_is_finished(tmp_path):
-    jobs = [
-        Job(experiment_jobs.dies_once, {"seed": s, "marker": str(tmp_path / "died")})
-        for s in range(6)
-    ]
-    kept = {}
+def test_a_lost_worker_ends_a_study(tmp_path):
+    marker = str(tmp_path / "died")
+    jobs = [Job(experiment_jobs.dies_once, {"seed": s, "marker": marker}) for s in range(6)]
     with pytest.raises(GroundedError, match=holding("of 6", "--jobs")):
-        run_jobs(jobs, Engine(jobs=2), finished=kept)
-    assert run_jobs(jobs, Engine(jobs=2), finished=kept) == [{"seed": s} for s in range(6)]
+        run_jobs(jobs, Engine(jobs=2))
 
 
 def test_no_workers_are_refused():

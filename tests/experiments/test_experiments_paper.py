@@ -22,14 +22,8 @@ def plain(result):
 
 
 @pytest.fixture(scope="module")
-def jobs():
-    """What the flights of `flown` gave, by job."""
-    return {}
-
-
-@pytest.fixture(scope="module")
-def flown(jobs):
-    return flight.run(1, finished=jobs)
+def flown():
+    return flight.run(1)
 
 
 def test_the_aircraft_ends_within_two_per_cent_of_the_optimum(flown):

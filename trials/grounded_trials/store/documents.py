@@ -1,4 +1,4 @@
-"""JSON files: documents with a checksum, results of studies, notes on trials.
+"""JSON files: documents with a checksum, notes on trials.
 
 A document's file begins with the SHA-256 of all bytes that follow, so that a flipped bit is
 detected:
@@ -17,7 +17,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, MutableMapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,25 +26,24 @@ from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.result import MALFORMED, Document
 from grounded_trials.plain_file import open_file, unreadable
-from grounded_trials.store.store import Lost, Store, made_folder, write_atomically
+from grounded_trials.store.store import Lost, Store, write_atomically
 
 D = TypeVar("D", bound=Document)
 _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
-def write_document(path: Path, document: Mapping[str, Any], *, nan: bool = False) -> None:
+def write_document(path: Path, document: Mapping[str, Any]) -> None:
     """Write a JSON document with its checksum, atomically.
 
     Args:
         path: the file.
         document: the contents.
-        nan: allow NaN and infinity, which are not JSON but which Python reads.
 
     Raises:
         GroundedError: if it can't be written.
-        ValueError: if a number is not finite, unless `nan`.
+        ValueError: if a number is not finite.
     """
-    text = json.dumps(dict(document), indent=1, ensure_ascii=False, allow_nan=nan)
+    text = json.dumps(dict(document), indent=1, ensure_ascii=False, allow_nan=False)
     rest = text[1:].encode() + b"\n"
     digest = hashlib.sha256(rest).hexdigest()
     write_atomically(path, b'{\n "sha256": "' + digest.encode() + b'",' + rest)
@@ -95,44 +94,6 @@ def proven(data: bytes, path: Path) -> dict[str, Any]:
         raise refused("file.changed", path, what="checksum")
     document: dict[str, Any] = json.loads(b"{" + found[2])
     return document
-
-
-class StudyStore(MutableMapping[str, dict[str, Any]]):
-    """Results of a study's jobs by key, one document each, so that a study can be continued.
-
-    A file is named by the hash of the job's key and holds the key and the result. A file that can't
-    be read, or that holds another key, is treated as missing.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self.folder = made_folder(folder)
-
-    def _path(self, key: str) -> Path:
-        return self.folder / f"{hashlib.sha256(key.encode()).hexdigest()[:24]}.json"
-
-    def _read(self, path: Path) -> dict[str, dict[str, Any]]:
-        """Return the key and result of a file, {} if it can't be read."""
-        try:
-            entry = read_document(path)
-            return {str(entry["key"]): dict(entry["result"])}
-        except (OSError, *MALFORMED, GroundedError):
-            return {}
-
-    def __getitem__(self, key: str) -> dict[str, Any]:
-        return self._read(self._path(key))[key]
-
-    def __setitem__(self, key: str, value: dict[str, Any]) -> None:
-        write_document(self._path(key), {"key": key, "result": value}, nan=True)
-
-    def __delitem__(self, key: str) -> None:
-        self._path(key).unlink()
-
-    def __iter__(self) -> Iterator[str]:
-        for path in sorted(self.folder.glob("*.json")):
-            yield from self._read(path)
-
-    def __len__(self) -> int:
-        return sum(1 for _ in self)
 
 
 class Notes:

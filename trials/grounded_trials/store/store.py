@@ -9,7 +9,7 @@ A file is copied to a temporary name in the same folder, synced and renamed, and
 synced, before it is acknowledged. A lock keeps other processes out. A killed process may leave a
 temporary file, which the next process removes.
 
-`documents.py` handles JSON files (notes, diagnoses, results of studies).
+`documents.py` handles JSON files (notes, diagnoses).
 """
 
 from __future__ import annotations
