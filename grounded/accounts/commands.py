@@ -39,7 +39,7 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
 
-EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift tried; coarse spacing
+EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift; calibrated near it
 STARTS = 120  # samples to predict from
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
 SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
@@ -73,40 +73,35 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
     """
     trial = trial.until(trial.known_steps)
     reach = min(round(REACH_S / trial.dt), trial.steps // 4)
-    least, every = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
+    least, near = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
     if reach <= least:
         return None
     seen = known_states(trial, shown)
     trial, known = _with_differences(model, trial, seen)
-    ones, steps = np.ones(model.m), trial.steps - reach
+    ahead = Ahead(model, trial, known, STARTS, DELAYS, linear=True, early=reach)
+    ones = np.ones(model.m)
 
-    def later(k: int, delays: tuple[float, ...] = (0.0,)) -> Ahead:
-        sent = trial.inputs[k : k + steps]
-        moved = replace(trial, states=trial.states[: steps + 1], inputs=sent)
-        return Ahead(model, moved, known, STARTS, delays, linear=True)
-
-    def as_told(ahead: Ahead) -> Fit:
-        free = ahead.best([ones])
-        near = ((free.gains > 1 / LIKE) & (free.gains < LIKE)).all()
-        return free if near else ahead.best([ones], free=False)
+    def as_told(k: int) -> Fit:
+        free = ahead.best([ones], late=-k)
+        like = ((free.gains > 1 / LIKE) & (free.gains < LIKE)).all()
+        return free if like else ahead.best([ones], free=False, late=-k)
 
     with np.errstate(all="ignore"):
-        logged = later(0, DELAYS)
-        if not logged.enough:
+        if not ahead.enough:
             return None
         # the shift that the model as it is likes best, then its neighbours, calibrated
-        shifts = np.arange(least, reach + 1, every)
-        moved = later(0).advanced(trial.inputs, shifts)
-        about = int(shifts[int(np.argmin(moved))])
-        if moved.min() > logged.plain(ones).score - HINT:
+        moved = ahead.scores(ones, -np.arange(least, reach + 1))
+        about = least + int(np.argmin(moved))
+        if moved.min() > ahead.plain(ones).score - HINT:
             return None
-        near = range(max(least, about - every + 1), min(reach, about + every - 1) + 1)
-        fits = {k: as_told(later(k)) for k in near}
+        fits = {
+            k: as_told(k) for k in range(max(least, about - near), min(reach, about + near) + 1)
+        }
         k = min(fits, key=lambda k: fits[k].score)
         # all that past and present commands can do
         before = min(
-            logged.best([ones, 0.0 * ones]),
-            logged.whatever_commands_do().best([ones]),
+            ahead.best([ones, 0.0 * ones]),
+            ahead.whatever_commands_do().best([ones]),
             key=lambda fit: fit.score,
         )
     parts, gain = fits[k].rms / before.rms, before.score - fits[k].score

@@ -125,6 +125,7 @@ class Ahead:
         linear: also remove errors that are linear in the initial states.
         constant: remove a constant rate of each state.
         horizon: how far ahead is predicted [s].
+        early: steps by which commands may act early.
     """
 
     def __init__(
@@ -138,6 +139,7 @@ class Ahead:
         linear: bool = False,
         constant: bool = True,
         horizon: float = AHEAD_S,
+        early: int = 0,
     ) -> None:
         self.model, self.shown, self.sent, self.dt = model, list(shown), trial.inputs, trial.dt
         self.steps = max(1, round(horizon / trial.dt))
@@ -145,7 +147,7 @@ class Ahead:
         logged = starts_from(model, trial.states, self.shown)
         good = np.asarray(np.isfinite(logged).all(axis=1))
         at = np.flatnonzero(good[: -self.steps] & good[self.steps :])
-        at = at[(at >= max(self.delays)) & (at + self.steps <= len(self.sent))]
+        at = at[(at >= max(self.delays)) & (at + self.steps + early <= len(self.sent))]
         self.at = at[:: -(-len(at) // starts)] if len(at) else at
         self.first, self.last = logged[self.at], logged[self.at + self.steps]
         self.left_out = basis(self.first[:, self.shown] if linear else self.first[:, :0])
@@ -192,14 +194,14 @@ class Ahead:
         """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
         return self._fit(self.size(self._off(gains, self.model.values, 0)[0]), gains)
 
-    def advanced(self, sent: Array, steps: Steps) -> Array:
-        """Return the errors of the uncalibrated model [nats] with later commands, (K,).
+    def scores(self, gains: Array, late: Steps) -> Array:
+        """Return the errors of the uncalibrated model [nats] with commands some steps late, (K,).
 
         Args:
-            sent: commands (T, m), beyond the trial's end too.
-            steps: by how many steps later ones act, (K,).
+            gains: of the inputs (m,).
+            late: by how many steps they act late, (K,); below 0 early, at most by `early`.
         """
-        off = self._with(sent)._off(np.ones(self.model.m), self.model.values, -steps)
+        off = self._off(gains, self.model.values, late)
         return np.array([np.log(self.size(one)).sum() for one in off])
 
     def still(self) -> Fit:
@@ -207,21 +209,20 @@ class Ahead:
         mean = np.broadcast_to(self.sent.mean(axis=0), self.sent.shape)
         return self._with(mean)._fitted(np.ones(self.model.m), 0, free=False)
 
-    def best(self, starts: Sequence[Array], *, free: bool = True) -> Fit:
+    def best(self, starts: Sequence[Array], *, free: bool = True, late: int | None = None) -> Fit:
         """Return the best fit over several initial gains, each with its best delay.
 
         Args:
             starts: initial gains (m,) each.
             free: fit the gains as well as the parameters.
+            late: the delay [steps]; None: the one of `delays` that fits best.
         """
-        fits = [self._fitted(gains, self._late(gains), free=free) for gains in starts]
+        each = np.array(self.delays if late is None else [late])
+        fits = [
+            self._fitted(gains, int(each[self.scores(gains, each).argmin()]), free=free)
+            for gains in starts
+        ]
         return min(fits, key=lambda fit: fit.score)
-
-    def _late(self, gains: Array) -> int:
-        """Return the command delay [steps] that fits best with these gains."""
-        off = self._off(gains, self.model.values, np.array(self.delays))
-        left = [float(np.log(self.size(one)).sum()) for one in off]
-        return self.delays[int(np.argmin(left))]
 
     def _with(self, sent: Array) -> Ahead:
         other = object.__new__(Ahead)

@@ -26,7 +26,6 @@ from grounded.accounts.sent import (
     DECISIVE,
     EXPLAINED,
     FINE,
-    SAME,
     SLIGHT,
     STEPS_TO_JUDGE,
     Following,
@@ -36,9 +35,7 @@ from grounded.accounts.sent import (
     evidence,
     follows,
     latest,
-    states_ago,
 )
-from grounded.accounts.signals import limits_of, span
 from grounded.accounts.table import Account, of_commands, unit_named
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
@@ -49,15 +46,12 @@ from grounded.result import figure, number, with_unit
 from grounded.task import Task
 from grounded.trial import Trial
 
-ALIKE = 3.0  # [nats] by which a story must lead where the commands are alike as logged
 ROWS_IN_FULL = 12  # rows that are compared in full
 OTHERS = 20  # number of latest candidates to compare with
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
 NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
 TIMES = {"ms": 1e3, "a clock": np.inf, "no unit: it stays 0": 0.0}  # in place of seconds
-AGES = (0.0, 1.0, 2.0)  # [steps] of the states acted on that rows are first compared with
 SHARES = np.arange(1, 49) / 50  # of its last value that a first-order filter keeps
-COARSE = 100  # steps of a run at which a log may begin, first tried
 
 
 class Kind(Enum):
@@ -207,20 +201,15 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
         plain: the comparison of its commands with the policy's.
     """
     fit = follows(row.policy, row.run, latest(task))
-    if fit is None or not fit.alike:
+    if fit is None or not fit.alike or fit.error > EXPLAINED:
         return
     plain = replace(plain, off=plain.off[: len(fit.off)])
-    tells, motion = _tells(plain, fit), apart(own, trial, row.steps)
+    motion, left = apart(own, trial, row.steps), _left(fit)
     for story in row.stories:
-        passed = story.kind is Kind.PROGRAM
+        there = motion if story.kind is Kind.PROGRAM else apart(own, row.run, row.steps)
         known = story.kind is Kind.UNIT and not row.fitted  # a unit that exists, or a sign
-        # a program's commands that hardly move are near to any that hardly move
-        share = _moved(own, trial, fit) if passed else 1.0
-        there = motion if passed else apart(own, row.run, row.steps)
-        sound = (tells or known) and fit.error < EXPLAINED * share and there <= motion
-        left, least = _left(fit) / share, ALIKE if plain.alike and not known else MARGIN
-        gained = np.log((_left(plain) + FINE) / (left + FINE)) >= story.price + least
-        if sound and gained and not (passed and plain.beyond):
+        gained = np.log((_left(plain) + FINE) / (left + FINE)) >= story.price + MARGIN
+        if gained and there <= motion and (known or _tells(plain, fit)):
             yield replace(story, commands=float(np.log(left + FINE)), motion=there)
 
 
@@ -229,14 +218,8 @@ def _left(ran: Following) -> float:
     return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
 
 
-def _moved(own: Ran, trial: Trial, fit: Following) -> float:
-    """Return how far the commands that moved most did, relative to their size, at most 1."""
-    most = np.abs(trial.inputs - own.policy.past).max(axis=0) * FINE / fit.fine
-    return float(np.clip(most.max(), FINE, 1.0))
-
-
 def _tells(plain: Following, fit: Following) -> bool:
-    """Return whether a policy explains nearly all commands in which it differs from the plain one.
+    """Return whether a policy is nearer in nearly all commands in which it differs from the plain.
 
     Many policies hold an input at the same limit: such commands are no evidence for one of them.
     """
@@ -255,17 +238,12 @@ def nearest(rows: Sequence[Row]) -> list[Row]:
     for some in groups.values():
         policy, runs = rows[some[0]].policy, [rows[k].run for k in some]
         T, past = min(runs[0].steps, policy.horizon), runs[0].start_inputs
-        states = np.stack([run.states[:T] for run in runs])
         sent = np.clip(np.stack([run.inputs[:T] for run in runs]), policy.low, policy.high)
-        left = np.full(len(some), np.inf)
-        for age in AGES if policy.gain is not None else AGES[:1]:
-            aged = np.stack([states_ago(x, age, policy.angles) for x in states])
-            asked = policy.commands(aged, policy.past if past is None else past)
-            size = np.maximum(np.abs(asked).max(axis=1), np.abs(sent).max(axis=1)) + 1e-12
-            for late in (0, 1):
-                a, b = asked[:, : T - late], sent[:, late:]
-                square = (((a - b) / size[:, None]) ** 2).mean(axis=2)
-                left = np.minimum(left, np.sqrt(np.median(square, axis=1) + 1e-3 * square.mean(1)))
+        states = np.stack([run.states[:T] for run in runs])
+        asked = policy.commands(states, policy.past if past is None else past)
+        size = np.maximum(np.abs(asked).max(axis=1), np.abs(sent).max(axis=1)) + 1e-12
+        square = (((asked - sent) / size[:, None]) ** 2).mean(axis=2)
+        left = np.sqrt(np.median(square, axis=1) + 1e-3 * square.mean(axis=1))
         for k, error in zip(some, left, strict=True):
             score[k] = np.log(error + FINE) + min(one.price for one in rows[k].stories)
     return [rows[k] for k in sorted(score, key=lambda k: score[k])[:ROWS_IN_FULL]]
@@ -528,15 +506,10 @@ def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:
     policy, most = own.policy, min(trial.finite_steps, own.policy.horizon)
 
     def left(k: int) -> float:
-        T = min(most, policy.horizon - k)
-        if T < STEPS_TO_JUDGE:
-            return np.inf
-        run = commanded(policy.after(k), trial.until(T))
+        run = commanded(policy.after(k), trial.until(min(most, policy.horizon - k)))
         return float(np.median((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))
 
-    stride = max(1, policy.horizon // COARSE)
-    best = min(range(0, policy.horizon, stride), key=left)
-    best = min(range(max(0, best - stride), best + stride + 1), key=left)
+    best = min(range(max(1, policy.horizon - STEPS_TO_JUDGE + 1)), key=left)
     if not best:
         return
     late, price = policy.dt * best, MARGIN * (1 + best / policy.horizon)
@@ -588,9 +561,8 @@ def suspicion(
     rivals = [(follows(c.policy, trial, late), c.id) for c in others[-OTHERS:] if c.id != own.id]
     alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]
     if sure := [one for one in alike if one[2] > DECISIVE]:
-        left, name, nats = min(sure)
-        near = name if left < max(CLEAR, SAME * ran.error) else ""
-        return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
+        _, name, nats = min(sure)
+        return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), name)
     some = cache(partial(stories, task, own, trial, ran, logged=logged))
     if ran.alike:
         return Suspicion(ran, asked=some)
@@ -601,12 +573,7 @@ def suspicion(
     if silent.any():
         names = [n for n, is_ in zip(trial.input_names, silent, strict=True) if is_]
         return Suspicion(ran, found("log.silent", *names, ran=own.id), asked=some)
-    units, facts = task.model.inputs, dict[str, Any]()
-    if ran.beyond:
-        j = trial.input_names.index(ran.beyond)
-        facts = {"beyond": ran.beyond, "logged": span(trial.inputs[:, j])}
-        facts["limits"] = limits_of(task, j)
     until = Quantity(ran.until_s if ran.opens else 0.0, "s")
-    rms = Quantity(ran.rms, units[ran.input])
-    why = found("log.not_run", ran.input, ran=own.id, rms=rms, until=until, **facts)
+    rms = Quantity(ran.rms, task.model.inputs[ran.input])
+    why = found("log.not_run", ran.input, ran=own.id, rms=rms, until=until)
     return Suspicion(ran, why, asked=some)

@@ -23,19 +23,15 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 STEPS_TO_JUDGE = 10  # smallest number of steps that can be judged
-# smallest number of steps that are alike and not at the limits, in which others are too
-STEPS_ALIKE = 5
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
 DECISIVE = 8.0  # [nats] of evidence that another candidate ran
 SAME, CLEAR = 0.5, 0.01  # shares: of another difference, and of an input, that count as none
-OUT = 0.1  # of an input's width: a command usually as far beyond its limits is another signal
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
 # differences of commands, relative to their size: of rounding, none, hardly any, alike, explained
 DIGITS, EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-5, 1e-3, 0.02, 0.05, 0.1
 LATEST = 3  # steps by which commands may be sent or logged late
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
-FOREIGN = 0.5  # of the squared difference of unrelated commands: from here on nothing is alike
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
 # differences from the prediction, of a state's usual size: alike; at most in any state of a run as
 # planned (a sign or a unit puts a column farther off); usual in a run like it (1.4 if unrelated)
@@ -48,7 +44,6 @@ class Following:
     """The comparison of a trial's commands with what a policy sends on its states."""
 
     alike: bool
-    beyond: str  # the input that is far beyond its limits on average, or usually, or ""
     error: float  # rms over steps and inputs, in units of each input's largest value
     input: str  # the input that differs most
     rms: float  # its rms difference, in its unit
@@ -57,7 +52,6 @@ class Following:
     late: int  # steps by which the log is late
     age: float  # of the states that it acted on, where its commands are logged [steps]
     moved: float  # squared difference at `late`, relative to that without shift
-    foreign: bool  # that input differs by about as much as unrelated commands do
     off: Array  # (T, m) sent minus policy's commands; NaN if not compared
     fine: Array  # (m,) resolution of the commands
 
@@ -82,27 +76,30 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     names = (policy.state_names, policy.input_names)
     if T < STEPS_TO_JUDGE or (trial.state_names, trial.input_names) != names:
         return None
+    # what the policy sends on states of several ages, and on those with their noise once more
     sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
     width = policy.high - policy.low
     earlier = [states_ago(trial.states[:T], back, policy.angles) for back in BACK]
-    noise = np.random.default_rng(0).normal(size=(T, trial.states.shape[1]))  # once more
+    noise = np.random.default_rng(0).normal(size=(T, trial.states.shape[1]))
     states = np.stack([*earlier, trial.states[:T] + noise * white_noise(trial.states[:T])])
     *_, with_noise = asked = policy.commands(states, policy.past if past is None else past)
     free = asked[:-1]
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
     size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
+    # the age and the shift that fit best, robust to a takeover in some steps
     fits = {}
     for late in range(-1, min(latest, T - STEPS_TO_JUDGE) + 1):
         a, b = free[:, max(0, -late) : T - max(0, late)], sent[max(0, late) : T - max(0, -late)]
         squares = (((a - b) / size[:, None]) ** 2).mean(axis=2)
         usual, mean = median(squares.T), squares.mean(axis=1)
-        for back, score in enumerate(usual + 1e-3 * mean):  # robust to a takeover in some steps
+        for back, score in enumerate(usual + 1e-3 * mean):
             fits[back, late] = (float(score), float(mean[back]), a[back], b, size[back])
     back, late = min(fits, key=lambda key: fits[key][0])
     _, error, asked, sent, size = fits[back, late]
     apart = np.full(policy.feedforward[:T].shape, np.nan)
     apart[max(0, late) :][: len(sent)] = sent - asked
     unmoved = min(fit[1] for key, fit in fits.items() if key[1] == 0)
+    # the difference from all ages near that one, beside that of unrelated commands
     near = [k for k, other in enumerate(BACK) if abs(other - BACK[back]) <= AGES]
     start = max(0, -late)
     within = free[near, start : start + len(sent)]
@@ -110,29 +107,27 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = (with_noise - free[0]) ** 2  # at samples, where it is largest
     room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
-    parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // STEPS_TO_JUDGE)))
-    bad = [bool((off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()) for k in parts]
     drawn_out = np.array([max(1.0, steps_alike(column) / ROUGH) for column in (sent - asked).T])
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
-    first = parts[bad.index(True)] if any(bad) else parts[0][:1]
-    left = first[int(np.argmax((off[first] > 2 * room[first]).any(axis=1)))]
+    # somebody may take over: every part must be alike
+    parts = np.array_split(np.arange(len(off)), max(1, min(WINDOWS, len(off) // STEPS_TO_JUDGE)))
+    bad = [k for k in parts if (off[k].mean(axis=0) > 2 * room[k].mean(axis=0)).any()]
+    first = bad[0] if bad else parts[0][:1]
+    left = int(first[np.argmax((off[first] > 2 * room[first]).any(axis=1))])
+    # commands far beyond their limits are only alike by clipping
     beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
-    # > 0: commands are only alike due to clipping, or most are not of this input
-    past_limits = np.maximum(beyond.mean(axis=0) - width, median(beyond) - OUT * width)
-    sane = not (past_limits > 0).any()
-    alike, j = bool(sane and share.max() <= 1 and not any(bad)), int(np.argmax(share))
+    sane = bool((beyond.mean(axis=0) <= width).all())
+    j, inside = int(np.argmax(share)), ((sent > policy.low) & (sent < policy.high)).any(axis=1)
     return Following(
-        alike=alike,
-        beyond="" if sane else policy.input_names[int(np.argmax(past_limits > 0))],
+        alike=bool(sane and share.max() <= 1 and not bad),
         error=float(np.sqrt((off / size**2).mean())),
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
-        until_s=float(left) * policy.dt if sane else 0.0,
-        opens=bool(sane and _opens(policy, asked[:left], sent[:left], off[:left], size)),
+        until_s=left * policy.dt * sane,
+        opens=sane and int(inside[:left].sum()) >= STEPS_TO_JUDGE,
         late=late,
         age=late + BACK[back],
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
-        foreign=bool(off[:, j].mean() > FOREIGN * unrelated[j]),
         off=apart,
         fine=FINE * size,
     )
@@ -177,23 +172,6 @@ def as_sent(policy: Policy, trial: Trial) -> bool:
         return False
     run = commanded(policy, trial)
     return bool((np.abs(run.asked - run.sent) < DIGITS * run.size).all())
-
-
-def _opens(policy: Policy, asked: Array, sent: Array, off: Array, size: Array) -> bool:
-    """Return whether the first commands of a policy and a log, (T, m), are alike by themselves.
-
-    In a part at rest, the noise of a later fall would excuse any difference; and commands that
-    stay at their limits are those of other policies too.
-    """
-    if len(off) < STEPS_TO_JUDGE:
-        return False
-    both = np.stack([asked, sent])
-    inside = (both > policy.low) & (both < policy.high)
-    switched = np.diff(both, axis=1, prepend=both[:, :1]) != 0
-    telling = (inside | switched).any(axis=(0, 2))
-    unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
-    alike = off.mean(axis=0) <= 2 * UNLIKE * unrelated + (0.02 * size) ** 2
-    return bool(telling.sum() >= STEPS_ALIKE and alike.all())
 
 
 def evidence(own: Array, other: Array) -> float:

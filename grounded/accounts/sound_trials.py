@@ -34,7 +34,6 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 GROSS = 0.7  # unexplained share of a row's motion that is reported
-ALIKE = 0.1  # relative tolerance within which several scales are one pace of the clock
 
 
 def sound_trials(
@@ -82,7 +81,6 @@ def sound_trials(
         found += ages.findings(one_message)
         found += _unexplained(model, ages.trials, verdict, shown)
         found += judge_time_step(model, ages.trials, ages.shown)
-        found = _by_the_clock(found, ages)
     judge_clocks(model, ages.trials, shown)
     for group in (ages.trials[:first], ages.trials[first:] if first else ()):
         judge_signs(model, group, shown)
@@ -155,20 +153,3 @@ def _unexplained(
         off = Quantity(float(gap.rate), per_second(model.states[name]))
         said = told_("sensor.mismatch", name, of=tuple(by), off=off)
         yield Finding(name, said, "mismatch", mend=said)
-
-
-def _by_the_clock(found: Sequence[Finding], ages: Ages) -> list[Finding]:
-    """Replace several scale findings by one of the clock, if that explains them all.
-
-    A clock that runs at half speed halves all derivatives, which looks like a scale of each sensor.
-    """
-    rates = [one for one in found if one.kind == "scale" and not one.corrected]
-    contradicted = any(name.startswith("sensor_scale:") for name in ages.refuted)
-    pace = float(np.exp(np.mean([np.log(one.scale) for one in rates]))) if rates else 1.0
-    alike = all(abs(one.scale / pace - 1) < ALIKE for one in rates)
-    if len(rates) < 2 or contradicted or not alike or abs(pace - 1) < 2 * ALIKE:
-        return list(found)
-    names = [one.signal for one in rates]
-    said = told_("log.pace", *names, by=1 / pace)
-    clock = Finding("+".join(names), said, "scale", scale=pace, mend=said)
-    return [clock if one is rates[0] else one for one in found if one not in rates[1:]]

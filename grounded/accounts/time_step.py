@@ -124,30 +124,25 @@ def judge_resolution(
         trials: in the model's units.
         shown: indices of the states with a sensor; the others are taken as 0.
     """
-    hidden, missed = [i for i in range(model.n) if i not in shown], list[Array]()
     if model.derivative is None or len(trials) < 2:
         return
-    reach = np.array([np.abs(np.nan_to_num(t.states)).max(axis=0) for t in trials])
-    usual = np.median([np.nan_to_num(t.states).std(axis=0) for t in trials], axis=0)
-    for trial in trials:
-        x = np.array(trial.states[:-1])
-        x[:, hidden] = 0.0
-        once, twice = (after_a_step(model, x, trial.inputs, trial.dt, parts) for parts in (1, 2))
-        off = np.abs(model.difference(once, twice)) / np.where(usual > 0, usual, np.inf)
-        off[:, hidden] = 0.0
-        missed.append(np.nan_to_num(off))
-    odd = [k for k, one in enumerate(missed) if one.max(initial=0.0) > MISSES]
-    for k in odd if 2 * len(odd) < len(trials) else ():
-        keep, trial = int(np.argmax(missed[k].max(axis=1) > MISSES)), trials[k]
-        far = np.median(np.delete(reach, k, axis=0), axis=0)
-        worst = int(np.argmax(missed[k][keep]))
-        name, unit = list(model.states.items())[worst]
+    own = np.isin(np.arange(model.n), shown)
+    states = [np.nan_to_num(np.where(own, trial.states, 0.0)) for trial in trials]
+    usual = np.median([x.std(axis=0) for x in states], axis=0)
+    cut = dict[int, tuple[int, int]]()
+    for k, (trial, x) in enumerate(zip(trials, states, strict=True)):
+        once, twice = (after_a_step(model, x[:-1], trial.inputs, trial.dt, n) for n in (1, 2))
+        off = np.abs(model.difference(once, twice)) / np.where((usual > 0) & own, usual, np.inf)
+        if (odd := np.nan_to_num(off) > MISSES).any():
+            keep = int(odd.any(axis=1).argmax())
+            cut[k] = keep, int(odd[keep].argmax())
+    for k, (keep, worst) in cut.items() if 2 * len(cut) < len(trials) else ():
+        (name, unit), trial = list(model.states.items())[worst], trials[k]
         said = told.found(
             "sensor.unresolved",
             name,
-            reach=Quantity(float(reach[k, worst]), unit),
+            reach=Quantity(float(np.abs(states[k][:, worst]).max()), unit),
             trial=trial.id or f"trial {k + 1}",
-            far=Quantity(float(far[worst]), unit),
             at=Quantity(keep * trial.dt, "s"),
             step=Quantity(1000 * trial.dt, "ms"),
         )

@@ -178,29 +178,6 @@ def test_a_trial_with_stamps_in_milliseconds_stops_the_diagnosis():
     assert error.value.then == NextCommand("discard", ("t0002",))
 
 
-BOTH = Model(
-    states={"q1": "rad", "q2": "rad", "w1": "rad/s", "w2": "rad/s"},
-    inputs={"u": "N m"},
-    params={},
-    derivative=lambda s, a, p: {"q1": s.w1, "q2": s.w2, "w1": a.u, "w2": -a.u},
-)
-
-
-@pytest.mark.parametrize(
-    ("off", "told"), [((1.0, 1.0, 2.0, 2.0), ["w1+w2"]), ((1.0, 1.0, 2.0, 1.5), ["w1", "w2"])]
-)
-def test_one_factor_of_all_rates_is_the_clock(off, told):
-    trials = []
-    for first, second in zip(arm(seed=1), arm(seed=2), strict=True):
-        a, b = first.states, second.states
-        states = np.column_stack([a[:, 0], b[:, 0], a[:, 1], b[:, 1]]) * off
-        trials.append(Trial(states, first.inputs, DT, BOTH.state_names, ("u",)))
-    found = [one for one in preflight(BOTH, trials).findings if one.kind == "scale"]
-    assert [one.signal for one in found] == told
-    assert found[0].scale == pytest.approx(off[2], rel=0.05)
-    assert (found[0].said.code == "log.pace") == ("+" in told[0])
-
-
 @pytest.mark.parametrize(
     ("factor", "rpm", "mended"),
     [(60 / (2 * np.pi), True, True), (2 * np.pi / 60, True, False), (9.2, False, False)],

@@ -181,7 +181,7 @@ ENTRIES: dict[str, Entry] = {
     "not_run": Entry(
         "refuse",
         "[[{log} did not run {ran}: ]]its commands are not what {ran} sends on the logged states: "
-        "{about} differs by {rms} (rms)[[; it is {logged}, beyond its [limits] {limits}]][[; alike "
+        "{about} differs by {rms} (rms)[[; alike "
         "up to {until}]][[; only {lasts} of commands]][[; {guessed} by [estimate] may be why]]",
         "who drove? Use --data, --candidate {ran} anyway, or set [log.span] start",
         hides=("log.start_doubt", "log.start_loose", "run.start", "run.reversed"),

@@ -106,8 +106,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "astray": Entry(
         "aside",
-        "it [[missed its prediction by {missed:,.3g}]][[cost {cost:,.3g}]], {times:,.2g} times "
-        "what runs do otherwise[[ ({others})]]",
+        "it missed its prediction by {missed:,.3g}, {times:,.2g} times what runs miss otherwise",
         ANEW,
         hides=OUTCOME[2:],
     ),
@@ -152,8 +151,7 @@ ENTRIES: dict[str, Entry] = {
         "warn",
         "the run started with {state} = {began}, the task's start is {start}: {off} off[[, as "
         "those of {runs} other runs, off by {rms} (rms)]][[; by the model "
-        "that changes its utility by {change:+.3g}]]: the run counts[[, and is to be run once "
-        "{again:True=more}]]",
+        "that changes its utility by {change:+.3g}]]: the run counts",
         "place the robot nearer to the start next time, or write in [task] start where it always "
         "starts, and propose again",
     ),

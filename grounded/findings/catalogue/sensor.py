@@ -34,7 +34,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "unresolved": Entry(
         "warn",
-        "reaches {reach} in {trial}, {far} in most others: from {at} on, the model can't be "
+        "reaches {reach} in {trial}: from {at} on, the model can't be "
         "integrated with time steps of {step}, and the rest of that trial is left out",
     ),
     # how to mend it for good

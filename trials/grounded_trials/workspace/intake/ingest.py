@@ -48,10 +48,8 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     others_differ,
     repeated,
 )
-from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
-from grounded_trials.workspace.intake.remarks.gone_wrong import ended_early, gone_wrong
-from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS, log_faults
+from grounded_trials.workspace.intake.remarks.gone_wrong import shown_by
+from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS
 from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import Situation, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -258,14 +256,17 @@ class Stored:
             yield read.before.finding(used=not self.aside)
         if self.now and (changed := overtaken(here, ran=True)):
             yield changed.weighing(Weight.WARN)
-        whole = interpolate_gaps(trial).trial
-        yield from log_faults(here, whole, own=read.own)
-        yield begun_elsewhere(here, trial)
         yield from _checked(here, trial, read.last_s)
-        if not read.doubted:
-            yield ran_otherwise(here, trial)
-        yield gone_wrong(here, whole, self.tried, self.now.history if self.now else ())
-        yield ended_early(here, trial, read.silent)
+        history = self.now.history if self.now else ()
+        yield from shown_by(
+            here,
+            trial,
+            self.tried,
+            history,
+            own=read.own,
+            doubted=read.doubted,
+            silent=read.silent,
+        )
 
     @property
     def verdict(self) -> str:

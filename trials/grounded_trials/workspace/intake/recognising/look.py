@@ -9,7 +9,6 @@ whole still resemble the candidate's.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +19,6 @@ from grounded.accounts.sent import (
     FINE,
     LATEST,
     RESEMBLES,
-    STEPS_ALIKE,
     STEPS_TO_JUDGE,
     Following,
     evidence,
@@ -37,32 +35,6 @@ LOOSE = 0.1  # uncertainty of a start, in steps, above which it is another, or i
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
-
-
-def behind(log: Recording, policy: Policy, found: Start | None, *, sure: bool) -> Start | None:
-    """Return where a run begins whose commands are some steps late, or None.
-
-    The same commands are exact that many steps later, on samples that were as old; but there the
-    program had sent something before its first step.
-
-    Args:
-        log: the log.
-        policy: the candidate's.
-        found: the start that fits best with commands in time.
-        sure: the commands are exact there.
-    """
-
-    def opens(at: float) -> bool:
-        return any(abs(one - at) < ALIGNED * log.interval for one in log.openings)
-
-    if found is None or policy.gain is None or (sure and opens(found.seconds)):
-        return None
-    for late in range(1, LATEST + 1):
-        for begun in filter(opens, (found.seconds, found.seconds - late * log.dt)):
-            fit = acted_on(log, policy, begun + late * log.dt)
-            if fit and fit.throughout and round(float(fit.old.max()) / log.dt) == late:
-                return replace(found, seconds=begun, alike=True, exact=True, loose_s=0.0)
-    return None
 
 
 class Sender(NamedTuple):
@@ -209,6 +181,6 @@ def _ceased(task: Task, trial: Trial, ran: Following) -> int | None:
     moves = np.flatnonzero((np.abs(np.diff(sent, axis=0)) > ran.fine).any(axis=1))
     held = int(moves[-1]) + 1 if len(moves) else 0
     before, after = (float((part**2).mean()) for part in (off[: max(held, 1)], off[held:]))
-    if T - held >= STEPS_ALIKE and after > max(EXPLAINED**2, 4 * before):
+    if T - held >= STEPS_TO_JUDGE and after > max(EXPLAINED**2, 4 * before):
         return held
     return None if ran.alike else round(ran.until_s / task.dt)

@@ -51,9 +51,7 @@ from grounded_trials.workspace.intake.opening.foreign import (
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 from grounded_trials.workspace.intake.recognising.look import (
-    ALIGNED,
     LOOSE,
-    behind,
     elsewhere,
     fall_in,
     sender_of,
@@ -151,16 +149,10 @@ class Case:
         self.found = start = self.start_of(self.own)
         sender = sender_of(log, self.own, self.rivals, self.start_of)
         self.exact = sender.own is not None and sender.own.exact
-        late = behind(log, self.own.policy, start, sure=sender.sure)
-        if late:
-            self.found, self.exact = late, True
-            if abs(late.seconds - log.first) > ALIGNED * log.interval:
-                self._cut(stored, late)
-            seen = self._judged(self.rivals)
-        elif start and elsewhere(log, start, self.own.policy, why=bool(seen.why)):
+        if start and elsewhere(log, start, self.own.policy, why=bool(seen.why)):
             self._cut(stored, start)
             seen = self._judged(self.rivals)
-        if late or sender.sure:
+        if sender.sure:
             return replace(seen, why=None, other="")
         if sender.other:
             return replace(seen, why=sender.why, other=sender.other)
@@ -362,8 +354,8 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
     """Return the run of a candidate that the user named, with what is doubtful about it."""
     log, ran, task = case.log, case.ran, case.task
     by_hand = log and not (case.opens or case.rival or case.silent)
-    foreign = by_hand and case.seen.ran and case.seen.ran.foreign and not case.seen.ran.opens
-    nobody = foreign and story.kind in (Kind.UNKNOWN, Kind.LOG)
+    nobody = by_hand and case.seen.ran and not case.seen.ran.opens
+    nobody = nobody and story.kind in (Kind.UNKNOWN, Kind.LOG)
     aside = story.kind in (Kind.PROGRAM, Kind.ROBOT) or nobody
     assert story.finding is not None
     doubts = [story.finding.weighing(Weight.ASIDE if aside else Weight.WARN)]

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -25,7 +24,8 @@ from grounded.accounts.sent import STEPS_TO_JUDGE, as_planned, like_predicted
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found, settle
 from grounded.frozen import median
-from grounded.search.candidate import Candidate
+from grounded.search.candidate import Candidate, Tried
+from grounded.search.run_motion import reversed_input, signs_of
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
@@ -34,9 +34,6 @@ from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.last_diagnosis import diagnosable
-
-if TYPE_CHECKING:
-    from grounded.search.candidate import Tried
 
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
 STRAYED = 100.0  # the same, from where on a run went far astray
@@ -57,39 +54,23 @@ def gone_wrong(
         tried: its candidate with all of its runs; None if it ran none.
         history: all candidates with their runs.
     """
+    run, missed, usual = trial, 0.0, 1.0
     others = [t for t in history if t.utilities and t is not tried and math.isfinite(t.utility)]
-    missed, usual = _missed(workspace, trial, tried, others) if tried else (0.0, 1.0)
-    astray = missed > SIGN_ASKED_FROM * usual
-    run = trial.until(workspace.task.horizon) if trial.candidate else trial
+    if tried:
+        run, missed = trial.until(workspace.task.horizon), tried.promised
+        missed -= workspace.task.utility(trial)
+        usual = max(abs(tried.promised), 1e-9)
+    if others:  # what the best one cost, and what runs miss otherwise
+        cost = min(abs(t.utility) for t in others)
+        usual = max(usual, cost, float(np.median([abs(t.promised - t.utility) for t in others])))
     if tried is None or not as_planned(tried.candidate, run):
-        from grounded.search.run_motion import reversed_input
-
+        astray = missed > SIGN_ASKED_FROM * usual
         if turned := reversed_input(workspace.planner, run, astray=astray):
             return _is_it_wired(workspace, trial, turned)
-    if tried is None:
-        return None
-    ran, each = tried.candidate.id, zip(tried.trials, tried.utilities, strict=True)
-    same = {one.id: -u for one, u in each if one.id != trial.id and math.isfinite(u)}
-    cost, most = -workspace.task.utility(trial), max(same.values(), default=math.inf)
-    if most > 0 and SIGN_ASKED_FROM * most < cost < math.inf:
-        one = found("run.astray", ran=ran, trial=trial.id, cost=cost, times=cost / most)
-        return one.also(others=tuple(same))
-    if others and astray and STRAYED * usual < missed < math.inf:
-        return found("run.astray", ran=ran, trial=trial.id, missed=missed, times=missed / usual)
+    if tried and others and STRAYED * usual < missed < math.inf:
+        ran, times = tried.candidate.id, missed / usual
+        return found("run.astray", ran=ran, trial=trial.id, missed=missed, times=times)
     return None
-
-
-def _missed(
-    workspace: Folder, trial: Trial, tried: Tried, others: Sequence[Tried]
-) -> tuple[float, float]:
-    """Return by how much a run missed its promised utility, and what runs miss otherwise."""
-    usual = max(
-        abs(tried.promised),
-        min((abs(t.utility) for t in others), default=0.0),
-        float(median(np.array([abs(t.promised - t.utility) for t in others]))) if others else 0.0,
-        1e-9,
-    )
-    return tried.promised - workspace.task.utility(trial), usual
 
 
 def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
@@ -97,8 +78,6 @@ def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
 
     If it did so in all of them, the model has the wrong sign: no run is at fault.
     """
-    from grounded.search.run_motion import signs_of
-
     each = [
         (one.id, signs_of(workspace.planner, one)[turned.about[0]])
         for one in diagnosable(workspace)
@@ -178,28 +157,50 @@ def unanswered(workspace: Folder) -> tuple[tuple[Finding, ...], NextCommand | No
     last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
     if last is None or "~" in last.trial.candidate or _decided(workspace, last):
         return (), None
-    some = settle(_open(workspace, last))
+    some = settle(one for one in _open(workspace, last) if one)
     aside = tuple(one for one in some if one.weight is Weight.ASIDE)
     return aside, NextCommand("discard", (last.stored.id,)) if aside else None
 
 
-def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding]:
-    """Yield what a stored trial shows that may be a reason to discard it, dear checks last."""
+def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding | None]:
+    """Yield what a stored trial shows that may be a reason to discard it."""
+    from grounded_trials.workspace.candidates.search_state import standing_in
+
     if last.stored.digest in workspace.noted.asked:
         yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
         return
-    some = [*log_faults(workspace, last.trial, own="source" not in last.meta)]
-    some += filter(None, [ran_otherwise(workspace, last.measured)])
-    some += filter(None, [begun_elsewhere(workspace, last.measured)])
-    yield from some
-    if any(one.weight is Weight.ASIDE for one in some):
-        return
-    from grounded_trials.workspace.candidates.search_state import standing_in
-
     history = standing_in(workspace).history
     tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)
-    wrong = gone_wrong(workspace, interpolate_gaps(last.trial).trial, tried, history)
-    yield from filter(None, [wrong, ended_early(workspace, last.measured)])
+    yield from shown_by(workspace, last.measured, tried, history, own="source" not in last.meta)
+
+
+def shown_by(
+    workspace: Folder,
+    trial: Trial,
+    tried: Tried | None,
+    history: Sequence[Tried],
+    *,
+    own: bool,
+    doubted: bool = False,
+    silent: Sequence[str] = (),
+) -> Iterator[Finding | None]:
+    """Yield what a stored trial shows of its log, its program, its start and its run.
+
+    Args:
+        workspace: the workspace with the task and the candidates.
+        trial: the trial as stored.
+        tried: its candidate with all of its runs; None if it ran none.
+        history: all candidates with their runs.
+        own: it was written by grounded, and not read through [log].
+        doubted: its candidate was named against its commands.
+        silent: states without a value in the rest of its log, where others have some.
+    """
+    whole = interpolate_gaps(trial).trial
+    yield from log_faults(workspace, whole, own=own)
+    yield None if doubted else ran_otherwise(workspace, trial)
+    yield begun_elsewhere(workspace, trial)
+    yield gone_wrong(workspace, whole, tried, history)
+    yield ended_early(workspace, trial, silent)
 
 
 def _decided(workspace: Folder, last: StoredTrial) -> bool:
