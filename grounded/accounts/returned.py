@@ -51,6 +51,7 @@ OTHERS = 20  # number of latest candidates to compare with
 ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
 NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
 TIMES = {"ms": 1e3, "a clock": np.inf, "no unit: it stays 0": 0.0}  # in place of seconds
+UNSENT, LOST = 5, 0.3  # steps before the first command, and share of all, that are not run
 SHARES = np.arange(1, 49) / 50  # of its last value that a first-order filter keeps
 
 
@@ -274,7 +275,7 @@ def rows_of(
     if fed:
         some += _fitted(task.model, own, trial, scales, logged)
         some += _smoothed(task.model, own, trial)
-    some += _clipped(own, trial)
+    some += [*_clipped(own, trial), *_held(own, trial)]
     return [*some, *(_later(own, trial, waits) if waits is not None else ())]
 
 
@@ -496,6 +497,40 @@ def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
         told = found("run.clipped", *cuts, ran=own.id, share=float(cut.mean()), at=where)
         clipped = replace(policy, low=ends[0], high=ends[1])
         yield Row(clipped, trial, (Story(Kind.PROGRAM, told),))
+
+
+def _held(own: Ran, trial: Trial) -> Iterator[Row]:
+    """Yield the policy that keeps its last command wherever the log has it once more.
+
+    A policy's plan, gains and reference change from step to step, so its commands change even if no
+    new states arrive: where they stay the same to the last digit, the step was not run.
+    """
+    policy, n, m = own.policy, len(own.policy.state_names), len(own.policy.input_names)
+    T, past = min(trial.steps, policy.horizon), trial.start_inputs
+    before = np.vstack([policy.past if past is None else past, trial.inputs[: T - 1]])
+    same = np.zeros(policy.horizon, bool)
+    same[:T] = (np.abs(trial.inputs[:T] - before) <= 1e-9).all(axis=1)
+    unsent, changed = int(np.argmin(same)), np.flatnonzero(~same[:T])
+    if unsent > UNSENT:
+        story = _passed("run.unsent", own, steps=unsent)
+    elif len(changed) >= STEPS_TO_JUDGE and same.mean() > LOST:
+        every, dt = 1e3 * policy.dt * float(np.median(np.diff(changed))), 1e3 * policy.dt
+        story = _passed("run.skipped", own, lost=float(same.mean()), every=every, dt=dt)
+    else:
+        return
+    shape = (policy.horizon, m, n + sum(policy.depths))
+    sent, gain, reference = (
+        np.array(np.zeros(other) if x is None else x)
+        for x, other in (
+            (policy.feedforward, shape[:2]),
+            (policy.gain, shape),
+            (policy.reference, shape[::2]),
+        )
+    )
+    newest = n + np.cumsum([0, *policy.depths[:-1]])  # of the past inputs
+    sent[same], gain[same], reference[same] = 0.0, 0.0, 0.0
+    gain[np.flatnonzero(same)[:, None], np.arange(m), newest] = 1.0
+    yield Row(replace(policy, feedforward=sent, gain=gain, reference=reference), trial, (story,))
 
 
 def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:

@@ -8,6 +8,7 @@ import pytest
 from cli import grounded
 from facts import of_code
 from grounded.errors import GroundedError, NextCommand
+from grounded.onboard import Runner
 from grounded.plant import Plant
 from grounded.trial import Trial
 from grounded_trials import Workspace
@@ -91,13 +92,17 @@ def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
 
 @pytest.mark.parametrize("every", [1, 3])
 def test_a_loop_slower_than_dt_is_told(w, every):
-    robot, policy = Plant(w.base_model.with_values({"mass": 1.4})), w.candidate("c0002")[0].policy
-    runs = np.repeat(np.arange(0, policy.horizon, every), every)[: policy.horizon]
-    gain, reference = (None if x is None else x[runs] for x in (policy.gain, policy.reference))
-    slow = replace(policy, feedforward=policy.feedforward[runs], gain=gain, reference=reference)
-    trial = robot.run(slow, dict.fromkeys(("x", "v"), 0.0), np.random.default_rng(0))
+    model, policy = w.base_model.with_values({"mass": 1.4}), w.candidate("c0002")[0].policy
+    runner, states, inputs = Runner(policy), [np.zeros(2)], []
+    for k in range(policy.horizon):
+        if k % every == 0:
+            sent = np.array(runner.action(k * policy.dt, states[-1]))
+        inputs.append(sent)
+        step = model.system.step(states[-1][None], sent[None], model.values, policy.dt)
+        states.append(step[0])
+    names = w.task.model.state_names, w.task.model.input_names
     file = w.folder / "t.mcap"
-    held = replace(trial, inputs=trial.inputs[runs], candidate="c0002")
+    held = Trial(np.array(states), np.array(inputs), policy.dt, *names, candidate="c0002")
     write_trial(file, held, {"kind": "trial", "task": w.task.hash})
     found = w.ingest(file)
     dt = 1e3 * policy.dt
