@@ -117,7 +117,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     # commands far beyond their limits are only alike by clipping
     beyond = np.abs(trial.inputs[:T] - np.clip(trial.inputs[:T], policy.low, policy.high))
     sane = bool((beyond.mean(axis=0) <= width).all())
-    inside = np.asarray((sent > policy.low) & (sent < policy.high)).any(axis=1)
+    inside = np.flatnonzero(((sent > policy.low) & (sent < policy.high)).any(axis=1))
     j = int(np.argmax(share))
     return Following(
         alike=bool(sane and share.max() <= 1 and not bad),
@@ -125,7 +125,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
         input=policy.input_names[j],
         rms=float(np.sqrt(off[:, j].mean())),
         until_s=left * policy.dt * sane,
-        opens=sane and int(np.sum(inside[:left])) >= STEPS_TO_JUDGE,
+        opens=sane and int((inside < left).sum()) >= STEPS_TO_JUDGE,
         late=late,
         age=late + BACK[back],
         moved=error / unmoved if unmoved > 1e-4 else 1.0,
