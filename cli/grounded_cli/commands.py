@@ -76,7 +76,7 @@ above = FloatRange(min=0, min_open=True)
 @option(
     "--kind",
     metavar="KIND",
-    help="car, rover, differential, boat, balance, drone, arm, pendulum, crane or generic.",
+    help="car, rover, differential, boat, drone, arm, pendulum or generic.",
 )
 @option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @table_layout

@@ -37,11 +37,10 @@ def target(
         if given is not None and shape not in shapes:
             raise misuse(" | ".join(shapes), f"--{name}", how="first")
     paces = {name: value for name, value in pace.items() if value is not None}
-    asked = {name: value for name, value in paces.items() if name in ("speed", "accel")}
-    if shape == "line" and seconds is not None and len(asked) > 1:
-        raise misuse("--seconds", "--speed with --accel")
+    if shape == "line" and seconds is not None and {"speed", "accel"} & paces.keys():
+        raise misuse("--seconds", "--speed and --accel")
     ends = values_by_name(to, "--to")
-    drawn = open_workspace().draw(Manoeuvre(shape, Drive(**paces), ends, seconds, asked, rest))
+    drawn = open_workspace().draw(Manoeuvre(shape, Drive(**paces), ends, seconds, rest))
     yield drawn
     _tell(drawn, shape, details=details)
 

@@ -119,7 +119,6 @@ class Manoeuvre:
         drive: size and pace of a path.
         to: where states end, or what they keep along a path.
         seconds: duration of a step or a line to a state; None: 5 s, or by the pace.
-        paces: those of `drive` that were asked for, among speed and accel.
         rest: whether the states that a line leaves free rest at its end.
     """
 
@@ -127,7 +126,6 @@ class Manoeuvre:
     drive: Drive = field(default_factory=Drive)
     to: Mapping[str, float] = field(default_factory=dict)
     seconds: float | None = None
-    paces: Mapping[str, float] = field(default_factory=dict)
     rest: bool = False
 
     @property
@@ -239,8 +237,7 @@ def _columns(workspace: Folder, asked: Manoeuvre, start: Mapping[str, float]) ->
     model, dt, shape = workspace.base_model, workspace.config.task.dt, asked.shape
     long = SECONDS if asked.seconds is None else asked.seconds
     if shape == "line" and (asked.to or not has_plane(model)):
-        pace = next(iter(asked.paces), "")
-        return line_target(asked.to, start, asked.drive, model, dt, asked.seconds, pace)
+        return line_target(asked.to, start, asked.drive, model, dt, asked.seconds)
     if shape == "step":
         return step_target(asked.to, model, dt, long, start)
     if asked.seconds is not None:

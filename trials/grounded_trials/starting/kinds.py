@@ -50,9 +50,6 @@ SENSED = re.compile(
     "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
 )
 OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
-PITCHES, ROLLS_ON = {"pitch", "tilt", "lean"}, {"x", "v", "position", "speed", "velocity", "wheel"}
-FLIES = {"roll", "yaw", "z", "thrust", "altitude", "elevator", "rudder", "steering", "psi"}
-SWINGS = re.compile(r"angle|swing|sway|pendulum|pole|theta|tilt")  # angle of a load on a trolley
 SPEEDS = ("v", "vel", "speed", "velocity", "linear", "lin_vel", "v_x", "vx")
 TURNS = ("w", "omega", "turn", "turn_rate", "yaw_rate", "angular", "ang_vel", "wz", "r")
 AFLOAT = re.compile(r"thruster|propeller|(^|[/._])(usv|wamv|boat|vessel)([/._\d]|$)")
@@ -263,19 +260,6 @@ class Clues:
         return f"{where}: {', '.join(names[:6])}" if where and several == (len(names) > 1) else ""
 
     @property
-    def hung(self) -> str:
-        """A trolley, and the load or pole that swings on it."""
-        own = [one for one in self.joints.items() if sum(map(slides, one[1])) == 1]
-        driving = ("/Odometry", "/Twist", "/TwistStamped")
-        if not own or any(t.type.endswith(driving) for t in self.log.topics):
-            return ""
-        topic, names = own[0]
-        slide, others = next(filter(slides, names)), [name for name in names if not slides(name)]
-        swings = (one.path for n, one in self.found.items() if SWINGS.search(n))
-        angles = others or [path for path in swings if path not in self.sent.values()]
-        return f"{topic}: {slide}, {angles[0]}" if angles and len(others) < 2 else ""
-
-    @property
     def sides(self) -> tuple[str, ...]:
         """The names of a left and a right command; () without both, or without a heading."""
         paths = {*self.log.moving} if self.headed else set[str]()
@@ -307,13 +291,6 @@ class Clues:
         return ", ".join(pairs[0]) if pairs and self.headed else ""
 
     @property
-    def balancing(self) -> str:
-        """The command of a robot balancing on two wheels."""
-        words = {word for name in self.found for word in (name.lower(), *name.lower().split("_"))}
-        rolls = bool(words & PITCHES and words & ROLLS_ON and not words & FLIES)
-        return next(iter(self.sent), "") if rolls and len(self.sent) == 1 else ""
-
-    @property
     def angle_and_torque(self) -> str:
         """The names of one joint."""
         words = {_word(one.path).lower() for one in self.log.numbers}
@@ -334,7 +311,6 @@ class Clues:
 
 EVIDENCE: tuple[tuple[str, Callable[[Clues], str]], ...] = (  # the first that a log has decides
     ("car", lambda clues: clues.ackermann),
-    ("crane", lambda clues: clues.hung),
     ("arm", lambda clues: clues.turning(several=True)),
     ("pendulum", lambda clues: clues.turning(several=False)),
     ("drone", lambda clues: clues.topic(FLYING)),
@@ -344,7 +320,6 @@ EVIDENCE: tuple[tuple[str, Callable[[Clues], str]], ...] = (  # the first that a
     ("rover", lambda clues: clues.topic("cmd_vel", fields=True)),
     ("differential", lambda clues: ", ".join(clues.sides)),
     ("rover", lambda clues: clues.speed_and_turn),
-    ("balance", lambda clues: clues.balancing),
     ("pendulum", lambda clues: clues.angle_and_torque),
     ("rover", lambda clues: clues.flat),
     ("generic", lambda clues: "--kind names another"),
@@ -374,22 +349,7 @@ def skeleton(kind: str, clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     if kind in ("differential", "boat"):
         sides = zip(plain.inputs, clues.sides, strict=False)
         return driven_by(plain, {old: (name, "1") for old, name in sides})
-    if kind == "crane" and len(clues.sent) == 1 and not {*clues.sent} <= {*plain.inputs}:
-        unit = _volts(clues)  # else it is a force
-        gain = plain.params["gain"].replace("m/s^2/N", "m/s^2" + "/V" * (unit == "V"))
-        return driven_by(plain, {"force": (next(iter(clues.sent)), unit)}, gain=gain)
-    if kind == "balance" and clues.balancing:
-        unit = _volts(clues)
-        unitless = {"kt": '0.5, "N m", 0.0001, 50.0', "ke": '0.03, "s/rad", 0.0, 5.0'}
-        own = unitless if unit == "1" else {}
-        return driven_by(plain, {"voltage": (clues.balancing, unit)}, **own)
     return plain
-
-
-def _volts(clues: Clues) -> str:
-    """Return the unit of a log's only command: V if it is a voltage, else none."""
-    ((name, path),) = clues.sent.items()
-    return "V" if command_unit(name, path, clues.units).endswith("V") else "1"
 
 
 def _drone(clues: Clues) -> Skeleton:

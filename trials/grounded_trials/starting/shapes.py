@@ -183,7 +183,6 @@ def line_target(
     model: Model,
     dt: float,
     seconds: float | None = None,
-    kept: str = "",
 ) -> dict[str, Array]:
     """Return the columns, (H + 1,) each, of a straight line from rest to rest, with their rates.
 
@@ -197,12 +196,10 @@ def line_target(
         model: the model of the states.
         dt: control interval [s].
         seconds: duration from rest to rest [s]; None: determined by `drive`.
-        kept: with `seconds`, which of "speed" and "accel" of `drive` is kept, while the other is
-            computed; "": both are computed.
 
     Raises:
         GroundedError: for an unknown state, a line of zero length, an ambiguous axis, a duration
-            that is not possible with the speed or acceleration kept, or a velocity of what the line
+            that is not positive, or a velocity of what the line
             moves that is not to end at 0.
     """
     _check(drive)
@@ -218,7 +215,7 @@ def line_target(
         goes = next((q for q in (*position_names(model), *rate_states(model)) if q not in to), "")
         raise wrong("--to", got=there, must="way", like=f"{goes}=1.0" if still and goes else None)
     if seconds is not None:
-        drive = _in_time(drive, length, seconds, kept)
+        drive = _in_time(drive, length, seconds)
         _grid(seconds + drive.hold, dt)
     along = np.linspace(0, length, FINE)
     limit = np.full(FINE, drive.speed)
@@ -234,18 +231,11 @@ def line_target(
     return columns
 
 
-def _in_time(drive: Drive, length: float, seconds: float, kept: str) -> Drive:
-    """Return the slowest and gentlest drive that covers a line in `seconds`, see `line_target`."""
+def _in_time(drive: Drive, length: float, seconds: float) -> Drive:
+    """Return the drive that covers a line in `seconds`, as gently as `drive` if it can."""
     positive("--seconds", seconds)
-    least = 4 * length / seconds**2  # accelerates to the middle, then decelerates
-    if kept == "speed":
-        if drive.speed * seconds <= length:
-            raise wrong("--seconds", seconds, low=f"{length / drive.speed:.3g} (at --speed)")
-        accel = drive.speed**2 / (drive.speed * seconds - length)
-        return replace(drive, accel=accel if drive.speed * seconds < 2 * length else least)
-    if kept == "accel" and drive.accel < least * (1 - 1e-9):
-        raise wrong("--accel", drive.accel, low=f"{least:.3g} (for --seconds)")
-    accel = max(drive.accel, least)
+    # at the least it accelerates to the middle, then decelerates
+    accel = max(drive.accel, 4 * length / seconds**2)
     root = np.sqrt(max((accel * seconds) ** 2 - 4 * accel * length, 0.0))
     return replace(drive, accel=accel, speed=float(accel * seconds - root) / 2)
 
