@@ -1,26 +1,18 @@
 """Exact derivatives of a graph, as nodes of the same graph: they share their work with the values.
 
-An edge from each node to each of its arguments carries the partial d op / d argument. By the chain
-rule a node between the variables and the outputs can be eliminated: its products of an edge above
-and one below become edges past it,
+Tangents are carried from the variables up,
 
-    d c / d a  +=  (d c / d b) (d b / d a).
+    d op(a, b) = (d op / d a) d a + (d op / d b) d b,
 
-In whatever order they go, what is left are the derivatives; the order decides how many products it
-takes. Least first (Markowitz, 1957) is about half of what tangents (from the variables up) or
-adjoints (from the outputs down) take. Where a graph blends branches, tangents are carried upwards,
-d op(a, b) = (d op / d a) d a + (d op / d b) d b, so that a branch that is not taken is left out as
-a whole. Indicator terms have the derivatives of their smoothed
-forms, which at eps = 0 are those of the branch that is taken. Where an operation is infinitely
-steep, as the speed sqrt(vx^2 + vy^2) is at rest, its slope counts as zero, which is one of its
-slopes there.
+so that a branch of a blend that is not taken is left out as a whole. Indicator terms have the
+derivatives of their smoothed forms, which at eps = 0 are those of the branch that is taken. Where
+an operation is infinitely steep, as the speed sqrt(vx^2 + vy^2) is at rest, its slope counts as
+zero, which is one of its slopes there.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
-from heapq import heapify, heappop, heappush
 
 from grounded.compile.trace.graph import Graph
 
@@ -39,106 +31,12 @@ def jacobian(
         outputs: node numbers.
         variables: node numbers of leaves.
     """
-    if any(graph.nodes[i].op == "blend" for i in graph.live(outputs)):
-        return carried(graph, outputs, variables)
-    return _Elimination(graph, outputs, variables).run()
-
-
-def carried(graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> list[dict[int, int]]:
-    """The same by tangents, from the variables up."""
     one = graph.const(1.0)
     tangents: dict[int, dict[int, int]] = {v: {v: one} for v in variables}
     for i in graph.live(outputs):
         if i not in tangents:
             tangents[i] = _tangent(graph, i, tangents)
     return [tangents[i] for i in outputs]
-
-
-class _Elimination:
-    """Edges that carry partials, to each node from below; above an output is -1, -2, ... for it."""
-
-    def __init__(self, graph: Graph, outputs: Sequence[int], variables: Sequence[int]) -> None:
-        self.graph, self.ends = graph, [-1 - place for place in range(len(outputs))]
-        self.below = defaultdict[int, dict[int, int]](dict)  # node -> argument -> partial
-        self.above = defaultdict[int, set[int]](set)
-        # by node: how many edges to below and from above it have a weight of 0, 1 and 2
-        self.lower = defaultdict[int, list[int]](lambda: [0, 0, 0])
-        self.upper = defaultdict[int, list[int]](lambda: [0, 0, 0])
-        moving = set(variables)
-        for i in graph.live(outputs):
-            node = graph.nodes[i]
-            if i in moving or node.op in FLAT or moving.isdisjoint(node.args):
-                continue
-            moving.add(i)
-            partials = RULES[node.op](graph, i, node.args)
-            for argument, partial in zip(node.args, partials, strict=True):
-                if argument in moving:
-                    self._add(i, argument, partial)
-        for end, i in zip(self.ends, outputs, strict=True):
-            if i in moving:
-                self._add(end, i, graph.const(1.0))
-        self.inside = sorted(moving.difference(variables))
-
-    def run(self) -> list[dict[int, int]]:
-        """Eliminates the nodes between, the cheapest first."""
-        costs = {i: self._cost(i) for i in self.inside}
-        heap = [(cost, i) for i, cost in costs.items()]
-        heapify(heap)
-        while heap:
-            cost, i = heappop(heap)
-            if costs.get(i) != cost:  # it was eliminated, or its cost has changed since
-                continue
-            del costs[i]
-            for other in self._eliminate(i) & costs.keys():
-                if costs[other] != (cost := self._cost(other)):
-                    costs[other] = cost
-                    heappush(heap, (cost, other))
-        constant = self.graph.constant
-        lines = (sorted(self.below[end].items()) for end in self.ends)
-        return [{v: d for v, d in line if constant(d) != 0.0} for line in lines]
-
-    def _add(self, i: int, argument: int, partial: int) -> None:
-        if self.graph.constant(partial) == 0.0:
-            return
-        known = self.below[i].get(argument)
-        if known is not None:
-            self._count(i, argument, known, -1)
-            partial = self.graph.node("add", known, partial)
-        self._count(i, argument, partial, 1)
-        self.below[i][argument] = partial
-        self.above[argument].add(i)
-
-    def _count(self, i: int, argument: int, partial: int, by: int) -> None:
-        weight = self._weight(partial)
-        self.lower[i][weight] += by
-        self.upper[argument][weight] += by
-
-    def _cost(self, i: int) -> int:
-        """Products that take the place of a node: 2 each, 1 where a factor is the same everywhere.
-
-        Those with plus or minus 1, and of two factors that are the same everywhere, are free.
-        """
-        (_, low, lows), (_, up, ups) = self.lower[i], self.upper[i]
-        return 2 * lows * ups + lows * up + low * ups
-
-    def _weight(self, partial: int) -> int:
-        """0 for plus or minus 1, 1 for a number that is the same in every sample, else 2."""
-        if self.graph.constant(partial) in (1.0, -1.0):
-            return 0
-        return 2 if self.graph.varies(partial) else 1
-
-    def _eliminate(self, i: int) -> set[int]:
-        """Leads the edges of a node past it; returns its neighbours."""
-        lower, upper = self.below.pop(i, {}), self.above.pop(i, set())
-        for j in sorted(upper):
-            partial = self.below[j].pop(i)
-            self._count(j, i, partial, -1)
-            for argument, d in lower.items():
-                self._add(j, argument, self.graph.node("mul", partial, d))
-        for argument, d in lower.items():
-            self._count(i, argument, d, -1)
-            self.above[argument].discard(i)
-        return upper.union(lower)
 
 
 def _tangent(graph: Graph, i: int, tangents: Mapping[int, Tangent]) -> dict[int, int]:
