@@ -15,7 +15,7 @@ import sys
 
 from benchmarks.foreign.optimum import optimum, remember
 from benchmarks.foreign.setups import SETUPS, setup
-from benchmarks.foreign.study import adopting, measured, results
+from benchmarks.foreign.study import measured, results
 
 
 def main() -> int:
@@ -23,7 +23,9 @@ def main() -> int:
     parser.add_argument("--only", action="append", help="set-ups whose names begin so")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
     parser.add_argument("--optimum", action="store_true", help="compute optima.json, which is slow")
-    parser.add_argument("--adopt", type=int, help="diagnose after so many trials, and adopt")
+    parser.add_argument(
+        "--adopt", type=int, default=0, help="diagnose after so many trials"
+    )
     parser.add_argument("--list", action="store_true", help="the names")
     asked = parser.parse_args()
     names = [n for n in SETUPS if not asked.only or n.startswith(tuple(asked.only))]
@@ -40,10 +42,8 @@ def main() -> int:
         say(f"{name}: {one.withheld} withheld ...")
         if asked.optimum:
             remember(name, *optimum(one, say))
-        elif asked.adopt:
-            print(adopting(one, asked.adopt), flush=True)
         else:
-            rows.append(measured(one))
+            rows.append(measured(one, asked.adopt))
             say(results(rows[-1:]).splitlines()[-1])
     if asked.json:
         print(json.dumps([row.to_json() for row in rows], indent=1))

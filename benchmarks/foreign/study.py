@@ -8,10 +8,7 @@ with nothing withheld there is no gap.
 from __future__ import annotations
 
 import re
-import signal
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -22,7 +19,6 @@ from benchmarks.helpers import table
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.parts import Diagnosis
 from grounded.policy import Policy
-from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
@@ -32,120 +28,75 @@ from grounded_trials.workspace.adopted import planner_of
 
 SHARES = (0.9, 0.97, 0.99)
 CLOSE = 0.005
-PATIENCE = 30.0  # [s] of CPU time
 
 
 @dataclass(frozen=True)
 class Row:
-    """One set-up: utilities, trials to SHARES, CPU time, the ending."""
+    """One set-up: what was claimed, utilities, trials to SHARES, CPU time, the ending."""
 
     name: str
     withheld: str
+    claimed: str
+    place: str  # of what is withheld, see `place_of`
     first: float
     final: float
     trials: int
     reached: tuple[int | None, ...]
     optimum: float | None
     seconds: float
-    phase: str
-    sentence: str
+    ended: str
 
     def to_json(self) -> dict[str, object]:
         """Return the row's values by name."""
         return asdict(self)
 
 
-class OutOfTime(BaseException):
-    """A method took longer than PATIENCE; not an Exception, so that no handler catches it."""
+def measured(setup: Setup, after: int = 0) -> Row:
+    """Run the search on one set-up, and adopt what a diagnosis claims.
 
-
-@contextmanager
-def patience(seconds: float) -> Iterator[None]:
-    """Raise OutOfTime inside the block after so many seconds of CPU time."""
-
-    def late(*_: object) -> None:
-        raise OutOfTime
-
-    before = signal.signal(signal.SIGPROF, late)
-    signal.setitimer(signal.ITIMER_PROF, seconds)
+    Args:
+        setup: the system.
+        after: trials after which it is diagnosed, or fewer where the search ends before; 0: never.
+    """
+    task, options, start = setup.task, SearchOptions(), time.process_time()
+    candidates: list[Candidate] = []
+    trials: list[Trial] = []
+    planner, claimed, place = Planner(task, task), "", "-"
     try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_PROF, 0.0)
-        signal.signal(signal.SIGPROF, before)
-
-
-def measured(setup: Setup) -> Row:
-    """Run the search on one set-up."""
-    utilities: list[float] = []
-
-    def run(candidate: Candidate) -> Trial:
-        trial = setup.run(candidate)
-        utilities.append(setup.task.utility(trial))
-        return trial
-
-    start = time.process_time()
-    try:
-        with patience(PATIENCE):
-            standing = learn(setup.task, run, SearchOptions()).standing
-        phase, sentence = standing.phase, standing.sentence
-    except OutOfTime:
-        phase, sentence = "out of time", f"not done after {PATIENCE:g} s of CPU time"
+        while True:
+            proposal = propose(task, candidates, trials, options, planner=planner)
+            made, ended = proposal.candidate, proposal.standing.phase
+            if after and not claimed and trials and (made is None or len(trials) == after):
+                found = diagnose(task, trials)
+                values, params = found.known_parameters, task.model.params
+                own = {name: one.value for name, one in values.items() if name in params}
+                named = [n for n in found.effects if not n.startswith("parameter:")]
+                fitted = task.with_model(task.model.with_values(own))
+                planner = planner_of(fitted, [{"name": n, **found.values(n)} for n in named])
+                planner, place = replace(planner, task=task), place_of(setup.cause, found)
+                claimed = " + ".join([*named, *own]) or "nothing"
+                continue
+            if made is None:
+                break
+            candidates += [made] * proposal.is_new
+            trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
     except Exception as error:
-        phase, sentence = "error", f"{type(error).__name__}: {error}"
-    seconds = time.process_time() - start
+        ended = f"{type(error).__name__}: {error}"
+    utilities = [task.utility(trial) for trial in trials]
     best = known().get(setup.name, {}).get("utility")
-    final = max(utilities, default=-np.inf)
     return Row(
         name=setup.name,
         withheld=setup.withheld,
+        claimed=claimed,
+        place=place,
         first=utilities[0] if utilities else -np.inf,
-        final=final,
+        final=max(utilities, default=-np.inf),
         trials=len(utilities),
         reached=trials_to(setup, utilities, best),
         optimum=best,
-        seconds=seconds,
-        phase=phase,
-        sentence=sentence,
+        seconds=time.process_time() - start,
+        ended=ended,
     )
-
-
-def adopting(setup: Setup, after: int) -> str:
-    """Run the search, adopting what a diagnosis claims; return a table line.
-
-    The diagnosis is one of `after` trials, or of fewer where the search ends before.
-    """
-    task, options = setup.task, SearchOptions()
-    candidates: list[Candidate] = []
-    trials: list[Trial] = []
-    seconds = 0.0
-    planner, claimed, place = Planner(task, task), "", "-"
-    while True:
-        proposal = propose(task, candidates, trials, options, planner=planner)
-        made = proposal.candidate
-        if not claimed and trials and (made is None or len(trials) == after):
-            began = time.process_time()
-            found = diagnose(task, trials)
-            seconds, place = time.process_time() - began, place_of(setup.cause, found)
-            own = {k: e.value for k, e in found.known_parameters.items() if k in task.model.params}
-            named = [n for n in found.effects if not n.startswith("parameter:")]
-            fitted = task.with_model(task.model.with_values(own))
-            planner = planner_of(fitted, [{"name": n, **found.values(n)} for n in named])
-            planner, claimed = replace(planner, task=task), " + ".join([*named, *own]) or "nothing"
-            continue
-        if made is None:
-            break
-        candidates += [made] * proposal.is_new
-        trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
-    utilities = [task.utility(trial) for trial in trials]
-    best, final = known().get(setup.name, {}).get("utility"), max(utilities)
-    reached = reached_in(trials_to(setup, utilities, best))
-    off = "-" if best is None else f"{100 * (best - final) / abs(best):.1f} %"
-    cells = (
-        setup.name, claimed, place, f"{utilities[0]:.4g}", f"{final:.4g}", off, str(len(trials)),
-        reached, f"{seconds:.0f}",
-    )  # fmt: skip
-    return f"| {' | '.join(cells)} |"
 
 
 def place_of(cause: str, found: Diagnosis) -> str:
@@ -178,11 +129,6 @@ def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple
     )
 
 
-def reached_in(trials: tuple[int | None, ...]) -> str:
-    """Return the trials of `trials_to` as text."""
-    return "/".join("-" if t is None else str(t) for t in trials)
-
-
 def held(setup: Setup) -> Policy:
     """Return a policy that holds the inputs from before the start."""
     return setup.task.policy(np.tile(setup.task.past, (setup.task.horizon, 1)), None, None)
@@ -194,15 +140,12 @@ def results(rows: list[Row]) -> str:
     def number(value: float | None) -> str:
         return "-" if value is None else f"{value:.4g}"
 
-    head = (
-        "set-up", "withheld", "first", "final", "optimum", "trials", "to 90/97/99 %",
-        "CPU s", "ended",
-    )  # fmt: skip
-    cells = [
-        (
-            r.name, r.withheld, number(r.first), number(r.final), number(r.optimum), r.trials,
-            reached_in(r.reached), f"{r.seconds:.1f}", f"{r.phase}: {r.sentence}",
-        )
-        for r in rows
-    ]  # fmt: skip
+    head = ("set-up", "withheld", "claimed", "place", "first", "final", "optimum", "trials")
+    head += ("to 90/97/99 %", "CPU s", "ended")
+    cells = []
+    for r in rows:
+        values = map(number, (r.first, r.final, r.optimum))
+        reached = "/".join("-" if t is None else str(t) for t in r.reached)
+        about = (r.name, r.withheld, r.claimed, r.place, *values, r.trials, reached)
+        cells.append((*about, f"{r.seconds:.1f}", r.ended))
     return table(head, cells)
