@@ -23,9 +23,7 @@ def main() -> int:
     parser.add_argument("--only", action="append", help="set-ups whose names begin so")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
     parser.add_argument("--optimum", action="store_true", help="compute optima.json, which is slow")
-    parser.add_argument(
-        "--adopt", type=int, default=0, help="diagnose after so many trials"
-    )
+    parser.add_argument("--adopt", type=int, default=0, help="diagnose after so many trials")
     parser.add_argument("--list", action="store_true", help="the names")
     asked = parser.parse_args()
     names = [n for n in SETUPS if not asked.only or n.startswith(tuple(asked.only))]

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from grounded.frozen import Array
 
-# Box-limited quadratic programmes: `interpreted.box_qp` and its twin `llvm_box`.
+# Box-limited quadratic programmes, see `llvm_box`.
 MAX_ITERATIONS = 50
 STOP = 1e-11  # on the free gradient, relative to |g|
 ARMIJO = 0.1

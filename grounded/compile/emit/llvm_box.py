@@ -1,8 +1,8 @@
 """Functions of m inputs: a factor of the free ones, and the box-limited quadratic programme.
 
-The compiled twin of `interpreted.box_qp`; the same steps in the same order. Everything is written
-out for m inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for an input that
-no bound holds back, else 0.
+Projected Newton (Tassa et al. 2014): on the free set, the inputs that no bound holds back, a Newton
+step is exact, so a handful of iterations end with the exact solution. Everything is written out for
+m inputs, in small arrays: H [m][m] = L D L', 1/D in `inv`, and `free`, 1 for a free input, else 0.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def clipped(f: Writer, value: str, low: str, high: str) -> str:
 
 
 class _Box:
-    """`void @box(H, g, low, high, k, free, L, inv)`: see `box_qp`."""
+    """`void @box(H, g, low, high, k, free, L, inv)`: k within its limits, and what is free."""
 
     def __init__(self, m: int) -> None:
         self.m = m
