@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from typing import Any
@@ -16,14 +15,12 @@ from grounded.diagnosis.causes import (
     value_called,
 )
 from grounded.diagnosis.error_report import RulerRow, errors, excess, lost_most, open_noise
-from grounded.diagnosis.levels import HALF, SURE
-from grounded.diagnosis.likelihood.simulated import simulated
+from grounded.diagnosis.levels import SURE
 from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.diagnosis.validation.claims import Claims
 from grounded.effects import ParamFamily
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
-from grounded.task import Task
 from grounded.trial import Trial
 
 
@@ -165,7 +162,6 @@ def next_step(
     claims: Claims,
     doubt: Finding | None,
     off: str,
-    task: Task | None,
     trials: Sequence[Trial],
     adopted: Collection[str] = (),
 ) -> Finding:
@@ -176,11 +172,10 @@ def next_step(
         claims: the causes that are claimed.
         doubt: why adopting them is unwise (`objection`).
         off: the state whose error has no known cause, or may be noise; "" for none.
-        task: the task of the candidates; None for bare trials.
         trials: those that were diagnosed.
         adopted: adopted effects, whose values are parameters of the model.
     """
-    model, names, effects = claims.data.model, claims.names, claims.best.hypothesis.effects
+    names, effects = claims.names, claims.best.hypothesis.effects
     if d.no_cause:
         return found("gap.next.record")
     if d.changed:
@@ -193,7 +188,7 @@ def next_step(
     if d.unconfirmed and not d.indistinguishable:
         effect = d.unconfirmed[0].effect
         return found("gap.next.confirm", effect, effect=effect)
-    look = _look(d, off, task, trials, simulated(model)) if off else None
+    look = _look(d, off, trials) if off else None
     if not names and look is not None:
         return look
     if not names and not claims.blamed:
@@ -206,9 +201,7 @@ def next_step(
     return found("gap.next.adopt", own="yes" if own else "no", left=bool(d.leftover))
 
 
-def _look(
-    d: Diagnosis, off: str, task: Task | None, trials: Sequence[Trial], step_only: bool
-) -> Finding:
+def _look(d: Diagnosis, off: str, trials: Sequence[Trial]) -> Finding:
     """Return what to run to investigate a leftover: first a repeat, then a new motion."""
     left = d.leftover[0] if d.leftover else None
     if left is not None and left.part is not None:
@@ -216,21 +209,9 @@ def _look(
         return found("gap.next.look", trial=part.trial, start=part.start, end=part.end)
     runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
     if max(runs.values(), default=0) > 1:
-        # most one-step errors may be in a rate, whose position only sums them up
-        first = d.where.channels[0] if left and not d.effects and d.where.channels else None
-        state = first.name if first is not None and first.share > HALF else off
         region = left.region if left is not None else None
-        there = region is not None and region.occupancy < HALF and not region.of_time
-        return found(
-            "gap.next.elsewhere",
-            state=state,
-            place=region.told if region is not None and there else None,
-            elsewhere=not there,
-            inputs=tuple(trials[-1].input_names) if not there else None,
-            term=left is not None and not step_only,
-        )
-    ran = [trial for trial in trials if trial.candidate] if task else []
-    best = max(ran, key=task.utility, default=None) if task else None
-    known = task is not None and best is not None and not math.isinf(task.utility(best))
-    name = best.candidate if known and best is not None else None
+        place = None if region is None or region.of_time else region.told
+        inputs = None if place else trials[-1].input_names
+        return found("gap.next.elsewhere", state=off, place=place, inputs=inputs)
+    name = trials[-1].candidate or None
     return found("gap.next.repeat", state=off, candidate=name, log=name is None)

@@ -171,7 +171,7 @@ class Writer:
         off = d.leftover[0].channel if d.leftover else open_noise(rows)
         ties = [group for group in d.indistinguishable if group not in d.equivalent]
         doubt = objection(rows, d.agreement, d.effects, ties, d.leftover)
-        step = next_step(d, self.claims, doubt, off, self.task, self.trials, self.adopted)
+        step = next_step(d, self.claims, doubt, off, self.trials, self.adopted)
         more = [found("gap.more", most=self.most)] * d.verdict.again
         return (*known, *more, *remarks(d, self.data.model, self.adopted), step)
 

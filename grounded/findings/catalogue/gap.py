@@ -156,10 +156,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.elsewhere": Entry(
         "note",
-        "run a trial[[ that spends more time where {place}]][[elsewhere?  with other steps and "
-        "sweeps of {inputs}]], to see what {state} lacks",
-        '[[term? or multiply each term of the rate of {state} by a Param(1.0, "1", 0.0, 2.0) and '
-        "diagnose again: what comes far from 1 is why]]",
+        "run a trial[[ that spends more time where {place}]][[ with other steps and sweeps of "
+        "{inputs}]], to see what {state} lacks",
     ),
     "next.fix": Entry("warn", FIX),
     "next.probe": Entry(
