@@ -7,6 +7,5 @@ Read `diagnose` first; its docstring lists the stages. `parts` holds the result.
     validation/    held-out prediction errors in units, and the decision what is claimed
     writer         the result: facts, and `remarks` with the next step as findings
     telling        what is told of it: lines, tables, findings and the next step
-    excitation     the next trial, which would separate tied effects; `design`: one from scratch
     pictures       the result in figures
 """

@@ -12,7 +12,6 @@ identifiable      what the data determine of each value, and what only priors se
 leftover          structure that no effect explains, and a curve that predicts it
 agreement         agreement of the trials; changes between two groups of them
 writer            the result; remarks: its findings and the next step; telling: its lines
-excitation        the next trial, to separate two explanations that tie
 """
 
 from __future__ import annotations

@@ -112,15 +112,6 @@ class Ranked(Document):
 
 
 @dataclass(frozen=True, eq=False)
-class Likeness(Document):
-    """A candidate that gains a share of what a claimed effect gains; 1: no log tells them apart."""
-
-    effect: str
-    like: str
-    share: float = math.nan
-
-
-@dataclass(frozen=True, eq=False)
 class Unconfirmed(Document):
     """A likely effect that only one group of trials shows: these."""
 
@@ -236,7 +227,6 @@ class Diagnosis(Document):
     ranking: tuple[Ranked, ...] = ()  # claimed effects first, then rejected ones
     indistinguishable: tuple[tuple[str, ...], ...] = ()  # groups that these trials can't separate
     equivalent: tuple[tuple[str, ...], ...] = ()  # groups that no trial can separate
-    lookalikes: tuple[Likeness, ...] = ()  # effects with nearly the signal of a claimed one
     acting: tuple[str, ...] = ()  # the claimed effects in the order in which they act
     gap: Gap = field(default_factory=Gap)
     leftover: tuple[Remainder, ...] = ()

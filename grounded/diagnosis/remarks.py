@@ -45,9 +45,6 @@ def remarks(d: Diagnosis, model: Model, adopted: Collection[str] = ()) -> Iterat
         code = "gap.equivalent" if group in d.equivalent else "gap.tie"
         own = not first.startswith("parameter:")  # a fit writes these
         yield found(code, *group, effect=first, others=tuple(others), own=own)
-    for one in d.lookalikes:
-        if one.share == 1.0:
-            yield found("gap.equivalent", one.effect, effect=one.effect, others=(one.like,))
     for seen in d.unconfirmed:
         yield found(
             "gap.unconfirmed",
@@ -185,7 +182,7 @@ def next_step(
     if separable:
         first, *others = separable[0]
         return found("gap.next.apart", effect=first, others=tuple(others))
-    if d.unconfirmed and not d.indistinguishable:
+    if d.unconfirmed:
         effect = d.unconfirmed[0].effect
         return found("gap.next.confirm", effect, effect=effect)
     look = _look(d, off, trials) if off else None

@@ -95,7 +95,6 @@ class Writer:
         ranking = self.claims.ranking(self.measured)
         groups = self.claims.groups()
         same = self.claims.equivalent(groups)
-        alike = self.claims.nearly(groups)
         measured = self.measured
         remainder = measured.remainders()
         rows, credit = measured.prediction_error(), measured.credits
@@ -125,7 +124,6 @@ class Writer:
             acting=_in_action(self.best.hypothesis, said.effects),
             indistinguishable=groups,
             equivalent=same,
-            lookalikes=alike,
             gap=Gap(
                 horizon_s=self.ruler.steps[-1] * data.dt,
                 unit="noise-normalised rms",

@@ -9,6 +9,7 @@ noise         of the sensors, and what it costs
 first_policy  the first policy: DDP from many starts, the first of them from `first_guess`
 making        builds a `candidate`: from a step, gentler gains, or the plan of a changed model
 planner       the model used for planning, with adopted effects
+design        the next trial for a diagnosis: a drive that tells values, a probe of a tie
 safety        checks a candidate before it is handed out
 pictures      figures of the search
 step/         the next step: its size, its direction, and the derivatives behind that

@@ -132,7 +132,6 @@ def hostile(folder):
     document["where"]["channels"][0] |= {"name": EVIL, "unit": EVIL}
     document["where"]["regions"][0]["when"] = EVIL
     document["where"]["whiteness"][EVIL] = 0.0
-    document["lookalikes"][0]["like"] = EVIL
     standing = replace(findings.standing, findings=(found("search.first", crashed=EVIL),))
     model = replace(
         findings.task.model,

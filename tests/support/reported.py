@@ -59,10 +59,6 @@ DIAGNOSIS: dict[str, Any] = {
         "floor": 1.0,
         "held_out": True,
     },
-    "lookalikes": [
-        {"effect": "viscous_friction:v", "like": "quadratic_drag:v", "share": 0.96},
-        {"effect": "viscous_friction:v", "like": "coulomb_friction:v", "share": 0.8},
-    ],
     "next_trial": "a fast run and a slow one",
     "parameters": {"mass": {"value": 1.4, "std": 0.02, "interval": [1.36, 1.44], "unit": "kg"}},
     "leftover": [

@@ -23,6 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,7 +36,6 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale, rates_of
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
-from grounded.diagnosis.parts import Likeness
 from grounded.effects import (
     Effect,
     InputFamily,
@@ -51,6 +51,14 @@ from grounded.model import Model
 NEARLY = 0.75  # share of an effect's gain from which a look-alike is named
 IDENTICAL = 1e-6  # fraction of a slope's power by which two equivalent effects may differ
 MOST_LOOKALIKES = 3  # most look-alikes named per effect
+
+
+class Likeness(NamedTuple):
+    """A candidate that gains a share of what an effect gains; 1: no log tells them apart."""
+
+    effect: str
+    like: str
+    share: float
 
 
 def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:

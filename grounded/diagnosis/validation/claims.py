@@ -22,7 +22,7 @@ from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.likelihood.predictor import Predictor
-from grounded.diagnosis.parts import Estimate, Likeness, Ranked
+from grounded.diagnosis.parts import Estimate, Ranked
 from grounded.diagnosis.validation.certainty import (
     Blame,
     averaged,
@@ -77,7 +77,9 @@ class Claims:
         self.blamed = self.moved if calibrating else ()
         self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
-        self.one_clock = one_clock(self.data.model, late, ruler.names, excitation(self.data).still)
+        clock = one_clock(self.data.model, late, ruler.names, excitation(self.data).still)
+        alike = () if known.no_cause else (*clock, *self.alike)
+        self.same = [(one.effect, one.like) for one in alike if one.share == 1.0]
 
     def _known(self, off: Sequence[Blame]) -> tuple[Blame, ...]:
         """Return the parameters that are off by as much as trials agree on, if one clearly is.
@@ -198,11 +200,12 @@ class Claims:
             same = dict.fromkeys(f.hypothesis.names[0] for f in exact if self._as_likely(f))
             found.append((f"parameter:{names[blame.index]}", *list(same)[:2]))
         found += [(name, *(other for other, _ in self.rivals(name))) for name in self.names]
+        found += [pair for pair in self.same if not any({*pair} <= {*group} for group in found)]
         return tuple(group for group in found if len(group) > 1)
 
     def equivalent(self, groups: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
         """Return the groups that are equivalent in the model, which no trial can separate."""
-        late = {(one.effect, one.like) for one in self.one_clock}
+        late = {*self.same}
         return tuple(
             (first, *others)
             for first, *others in groups
@@ -290,15 +293,6 @@ class Claims:
             for other, fit in self.rivals(name):
                 found.setdefault(other, (fit, self.lost[name] + self.search.score(fit) - best))
         return found
-
-    def nearly(self, groups: tuple[tuple[str, ...], ...]) -> tuple[Likeness, ...]:
-        """Return look-alikes by signal, without those that tie."""
-        if self.known.no_cause:
-            return ()
-        tied = {(group[0], other) for group in groups for other in group[1:]}
-        late = {(one.effect, one.like): one for one in self.one_clock}
-        found = {(one.effect, one.like): one for one in self.alike}
-        return tuple(one for key, one in (late | found | late).items() if key not in tied)
 
     def parameters(self) -> dict[str, Estimate]:
         """Return the values of the model's parameters, if they were calibrated."""

@@ -25,13 +25,12 @@ import numpy as np
 from grounded.diagnosis.error_report import CALIBRATION
 from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
-from grounded.diagnosis.hypotheses.lookalike import lookalikes
+from grounded.diagnosis.hypotheses.lookalike import Likeness, lookalikes
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
 from grounded.diagnosis.likelihood.intervals import fisher
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.parts import Likeness
 from grounded.diagnosis.validation.certainty import averaged
 from grounded.diagnosis.validation.choose import Choice, Errors, Option, Rule
 from grounded.diagnosis.validation.ruler import Ruler

@@ -145,7 +145,6 @@ def test_what_is_one_thing_beside_a_parameter_is_named_together():
     assert {*one.about} == pair
     rows = {row.effect: row for row in found.ranking}
     assert pair <= set(rows) and sum(rows[name].claimed for name in pair) == 1
-    assert not any({one.effect, one.like} == pair for one in found.lookalikes)
 
 
 def test_an_input_that_acts_the_other_way_round_is_found_at_its_size():
