@@ -63,7 +63,7 @@ def test_what_was_adopted_is_told_everywhere(folder, cart):
     (block,) = parameter_table(gather(Folder(folder)))
     row = dict(zip(block.header, next(r for r in block.rows if r[0] == "mass"), strict=True))
     assert (row["in model.py"], row["now"]) == ("1.000", "1.400")
-    assert row["diagnosed, 95 %"].startswith("1.400 (1.36")
+    assert row["diagnosed "].startswith("1.400 +- 0.020")
 
 
 DRAG = {"name": "quadratic_drag:v", "k": 0.2}

@@ -7,16 +7,15 @@ files; the report for a terminal and the recording take the same sentences and t
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from grounded.diagnosis.parts import Diagnosis, Estimate
-from grounded.diagnosis.pictures import accuracy_figure, credit_figure
+from grounded.diagnosis.pictures import accuracy_figure
+from grounded.diagnosis.telling import effect_table
 from grounded.diagnosis.telling import error_table as held_out_table
-from grounded.diagnosis.telling import weighed_beside
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
-from grounded.result import begun, listed, measured_alike
+from grounded.result import begun, measured_alike
 from grounded.search.difference import Difference, last_gain
 from grounded.search.pictures import MOST_DRAWN, few, search_figure
 from grounded_trials.report.figures.gap import forecast_figures, residual_figures
@@ -37,21 +36,17 @@ from grounded_trials.report.findings import (
 from grounded_trials.report.forecast import forecast_error
 from grounded_trials.wording import (
     count,
-    extent,
     figure,
     labelled,
     legend,
     or_zero,
-    percent,
     rendered,
     shown,
-    with_unit,
 )
 from grounded_trials.workspace.next_step import DIAGNOSE
 from grounded_trials.workspace.off_target import off_target_of
 
 OPEN = 12  # largest number of candidates whose table is shown unfolded
-UNKNOWN = "–"
 
 
 @dataclass(frozen=True)
@@ -60,7 +55,6 @@ class Block:
 
     text, soft, heading    a sentence
     command                a command to copy; `name` is its id
-    verdict                `lines`, one below the other
     table                  `name`, `header` (text columns end with a blank), `rows`; `strong` rows
                            are bold
     figure                 `figure`; with `wide` two panels per row
@@ -71,7 +65,6 @@ class Block:
     kind: str
     text: str = ""
     name: str = ""
-    lines: Sequence[str] = ()
     header: Sequence[str] = ()
     rows: Sequence[Sequence[str]] = ()
     strong: frozenset[int] = frozenset()
@@ -192,7 +185,7 @@ def _utility(findings: Findings) -> list[Block]:
 
 
 def _gap(findings: Findings) -> list[Block]:
-    """What was diagnosed, and forecasts of the crude model beside the better one; then details."""
+    """Errors of predictions, forecasts of the crude model beside the better one; then details."""
     diagnosis = findings.diagnosis
     ahead = [b for each in forecast_figures(findings) for b in _drawn(each, title=True)]
     ahead += forecast_table(findings)
@@ -200,14 +193,11 @@ def _gap(findings: Findings) -> list[Block]:
     if diagnosis is None:
         command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
         return [command, *ahead, *lacking]
-    verdict = Block("verdict", lines=findings.lines)
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
-        return [verdict, *ahead, *lacking]
-    proof = _drawn(accuracy_figure(diagnosis), title=True)
-    proof += _drawn(credit_figure(diagnosis), title=True)
-    found = [verdict, *proof, *ahead, *lacking]
+        return [*ahead, *lacking]
+    found = [*_drawn(accuracy_figure(diagnosis), title=True), *ahead, *lacking]
     found += _titled("Errors of held-out predictions", "held-out", *held_out_table(diagnosis))
-    return found + _effects(diagnosis, findings.since.adopted)
+    return found + _titled("Effects that were compared", "effects", *effect_table(diagnosis))
 
 
 def _titled(
@@ -282,76 +272,18 @@ def forecast_table(findings: Findings) -> list[Block]:
     return _titled(f"Prediction error {ahead:.3g} s ahead, rms", "forecasts", rows, header)
 
 
-def _effects(diagnosis: Diagnosis, adopted: Collection[str]) -> list[Block]:
-    """Return the ranked effects with their parameters and 95 % intervals."""
-    beside, rows = weighed_beside(diagnosis), []
-    for r in diagnosis.ranking:
-        nats = figure(r.evidence, 3)
-        texts = {name: _interval(value) for name, value in r.params.items()}
-        values = [
-            f"{name} = {text if text == UNKNOWN else with_unit(text, r.params[name].unit)}"
-            for name, text in texts.items()
-        ]
-        rows.append(
-            (
-                r.effect + " (adopted since)" * (r.effect in adopted),
-                *((nats, "") if r.effect in beside else ("", nats)),
-                figure(r.gap_after, 3),
-                percent(r.shrinkage) if not r.shrinkage < 0 else "none, it grows",
-                "; ".join(values) or "-",
-            )
-        )
-    evidence = ("evidence [nats]", "evidence alone [nats]")
-    header = ("effect", *evidence, "gap after", "gap closed", "parameters, 95 % ")
-    strong = {i for i, r in enumerate(diagnosis.ranking) if r.effect in diagnosis.effects}
-    made = table("effects", header, rows, strong)
-    return [Block("heading", "Effects that were compared"), made] if rows else []
-
-
 def parameter_table(findings: Findings) -> list[Block]:
-    """Return the model's parameters: in model.py, current, and as diagnosed."""
-    estimated = _estimated(findings.diagnosis)
-    rests = findings.diagnosis.conditions if findings.diagnosis else {}
-    rows = []
-    for name, param in findings.task.model.params.items():
-        bounded = param.low is not None or param.high is not None
-        limits = _range(param.low, param.high) if bounded else "none" if param.std else "constant"
-        found = _interval(estimated[name]) if name in estimated else "-"
-        if name in rests and name in estimated:
-            found += f", given {listed(rests[name])}"
-        written = figure(findings.nominal.get(name))
-        rows.append((name, written, figure(param.value), found, shown(param.unit), limits))
-    header = ("parameter", "in model.py", "now", "diagnosed, 95 %", "unit", "bounds")
+    """Return the model's parameters: in model.py, now, and as the last diagnosis has them."""
+    found = findings.diagnosis.parameters if findings.diagnosis else {}
+    rows = [
+        (
+            name,
+            figure(findings.nominal.get(name)),
+            figure(param.value),
+            found[name].text if name in found else "-",
+            shown(param.unit),
+        )
+        for name, param in findings.task.model.params.items()
+    ]
+    header = ("parameter", "in model.py", "now", "diagnosed ", "unit")
     return [table("parameters", header, rows)] if rows else []
-
-
-def _estimated(diagnosis: Diagnosis | None) -> dict[str, Estimate]:
-    """Return the parameters that a diagnosis calibrated, or claimed as an effect."""
-    if diagnosis is None:
-        return {}
-    found = dict(diagnosis.parameters)
-    then = {} if diagnosis.made is None else diagnosis.made.nominal
-    for row in diagnosis.ranking:
-        name = row.effect.removeprefix("parameter:")
-        if row.claimed and name in then and "d" in row.params and name not in found:
-            found[name] = row.params["d"].moved(then[name])
-    return found
-
-
-def _interval(v: Estimate) -> str:
-    """Return a value and its 95 % interval as text; `UNKNOWN` if the interval is too wide."""
-    if v.interval is None:
-        return figure(v.value)
-    low, high = v.interval
-    value = or_zero(v.value, low, high)
-    known = low <= v.value <= high and v.known
-    low, high = extent(low, high)
-    return f"{figure(value)} ({figure(low, 3)} to {figure(high, 3)})" if known else UNKNOWN
-
-
-def _range(low: float | None, high: float | None) -> str:
-    if low is not None and high is not None:
-        low, high = extent(low, high)
-    a = "−∞" if low is None or not math.isfinite(low) else f"{low:g}"
-    b = "∞" if high is None or not math.isfinite(high) else f"{high:g}"
-    return f"{a} to {b}"
