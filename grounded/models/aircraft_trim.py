@@ -7,8 +7,7 @@ turn is coordinated by beta = 0),
     u' = v' = w' = phi' = theta' = p' = q' = r' = altitude' = 0,  psi' = omega,  |V| = V,  v = 0,
 
 solved for the discrete model, x_{t+1} - x_t over one control step, so that the trim is exact in the
-simulation and works for any model with an aircraft's states, including adopted effects. All flight
-conditions are solved at once by Newton's method on the linearised model.
+simulation and works for any model with an aircraft's states, including adopted effects.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.optimize import root
 
 from grounded.checks import known, wrong
 from grounded.frozen import Array, readonly
@@ -54,20 +54,21 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
     names = model.state_names
     known("state", [*FREE, "north", "east", "altitude", "psi"], names, f"model '{model.name}'")
     x, a = _first_guess(model, speed, turn_rate)
-    free = [names.index(name) for name in FREE]
-    worst = np.inf
-    for _ in range(20):
-        error, slope = _equations(model, x, a, speed, turn_rate, dt)
-        worst = float(np.abs(error).max())
-        if not np.isfinite(worst) or worst < 1e-10:
-            break
-        try:
-            step = np.linalg.solve(slope, -error[..., None])[..., 0]
-        except np.linalg.LinAlgError:  # without air the control surfaces have no effect
-            break
-        scale = np.minimum(1.0, 0.5 / np.maximum(np.abs(step / (1 + speed[:, None])).max(1), 1e-12))
-        x[:, free] += scale[:, None] * step[:, : len(free)]
-        a += scale[:, None] * step[:, len(free) :]
+    free, n = [names.index(name) for name in FREE], len(FREE)
+    rows = [names.index(name) for name in (*STEADY, "psi")]
+    body, psi = [names.index(name) for name in ("u", "v", "w")], names.index("psi")
+    worst = 0.0
+    for k, (V, omega) in enumerate(zip(speed.tolist(), turn_rate.tolist(), strict=True)):
+
+        def unmet(unknown: Array, k: int = k, V: float = V, omega: float = omega) -> Array:
+            x[k, free], a[k] = unknown[:n], unknown[n:]
+            rate = (model.system.step(x[k : k + 1], a[k : k + 1], model.values, dt)[0] - x[k]) / dt
+            rate[psi] -= omega
+            return np.array([*rate[rows], np.linalg.norm(x[k, body]) - V, x[k, names.index("v")]])
+
+        with np.errstate(all="ignore"):
+            found = root(unmet, np.append(x[k, free], a[k]), tol=1e-13).x
+            worst = max(worst, float(np.nan_to_num(np.abs(unmet(found)).max(), nan=np.inf)))
     if not worst < 1e-6:
         got = (
             f"{speed.min():.2f} to {speed.max():.2f} m/s, up to {np.abs(turn_rate).max():.2f} rad/s"
@@ -94,29 +95,6 @@ def _first_guess(model: Model, speed: Array, turn_rate: Array) -> tuple[Array, A
     x = np.stack([guess.get(name, zero) for name in model.state_names], axis=1)
     a = np.stack([zero + 0.5 * (name == "throttle") for name in model.input_names], axis=1)
     return x, a
-
-
-def _equations(
-    model: Model, x: Array, a: Array, speed: Array, turn_rate: Array, dt: float
-) -> tuple[Array, Array]:
-    """Return the residuals (N, 12) and their derivative by the free states and inputs."""
-    names = model.state_names
-    free = [names.index(name) for name in FREE]
-    rows = [names.index(name) for name in (*STEADY, "psi")]
-    f_x, f_u = model.system.linearise(x, a, model.values, dt)
-    rate = (model.system.step(x, a, model.values, dt) - x) / dt
-    rate[:, names.index("psi")] -= turn_rate
-    body = [names.index(name) for name in ("u", "v", "w")]
-    V = np.sqrt((x[:, body] ** 2).sum(1))
-    error = np.column_stack([rate[:, rows], V - speed, x[:, names.index("v")]])
-
-    slope = np.zeros((len(x), 12, 12))
-    by_state = (f_x - np.eye(len(names))) / dt
-    slope[:, :10, :8] = by_state[:, rows][:, :, free]
-    slope[:, :10, 8:] = f_u[:, rows] / dt
-    slope[:, 10, :3] = x[:, body] / V[:, None]
-    slope[:, 11, FREE.index("v")] = 1.0
-    return error, slope
 
 
 def _due_north(model: Model, x: Array, a: Array, dt: float) -> Array:
