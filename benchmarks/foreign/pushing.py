@@ -1,17 +1,12 @@
-"""A block pushed over a floor with dry friction, in MuJoCo, and two crude models of it.
+"""A block pushed over a floor with dry friction, in MuJoCo, and a crude model of it.
 
-`plane`: a box that is free to tilt lies on a plane, under Coulomb friction at the contacts. The
-crude model is the quasi-static pusher-slider of the literature: an ellipsoidal limit surface
-(Lynch, Maekawa & Tanie 1992) and Coulomb friction at the pusher (Hogan & Rodriguez 2016), smooth.
-
-`axes`: dry friction that holds each axis by itself and no contact with the floor, which no floor
-does: a block that slides forward resists a sideways push in full. Its crude model knows the normal
-of the pushed face only.
+A box that is free to tilt lies on a plane, under Coulomb friction at the contacts. The crude model
+is the quasi-static pusher-slider of the literature: an ellipsoidal limit surface (Lynch, Maekawa &
+Tanie 1992) and Coulomb friction at the pusher (Hogan & Rodriguez 2016), smooth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -57,27 +52,6 @@ PLANE = """
   </actuator>
 </mujoco>"""
 
-AXES = """
-<mujoco model="block">
-  <option timestep="0.002" cone="elliptic" impratio="10"/>
-  <worldbody>
-    <body name="pusher" pos="-0.07 0 0">
-      <joint name="px" type="slide" axis="1 0 0" damping="1"/>
-      <joint name="py" type="slide" axis="0 1 0" damping="1"/>
-      <geom type="cylinder" size="0.02 0.05" mass="0.5" friction="0.4"/>
-    </body>
-    <body name="block">
-      <joint name="bx" type="slide" axis="1 0 0" frictionloss="1.5"/>
-      <joint name="by" type="slide" axis="0 1 0" frictionloss="1.5"/>
-      <joint name="byaw" axis="0 0 1" frictionloss="0.05"/>
-      <geom type="box" size="0.05 0.05 0.05" mass="{mass}" friction="0.4"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <velocity name="vx" joint="px" kv="100"/><velocity name="vy" joint="py" kv="100"/>
-  </actuator>
-</mujoco>"""
-
 
 def slider_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
     """Return ds/dt of a quasi-static pusher-slider, pushed by its left face.
@@ -103,53 +77,27 @@ def slider_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
     }
 
 
-def normal_dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
-    """Return ds/dt of quasi-static pushing by the left face; overlap moves and turns the block."""
-    cos, sin = np.cos(s.byaw), np.sin(s.byaw)
-    dx, dy = s.px - GAP - s.bx, s.py - s.by
-    ahead, aside = cos * dx + sin * dy, cos * dy - sin * dx
-    overlap = ahead + HALF + RADIUS
-    push = p.k * SOFT * np.logaddexp(0.0, overlap / SOFT)
-    return {
-        "px": a.vx,
-        "py": a.vy,
-        "bx": cos * push,
-        "by": sin * push,
-        "byaw": -push * aside / p.c,
-    }
-
-
-def model(name: str, dynamics: Callable[..., dict[str, Any]], params: dict[str, Param]) -> Model:
+def model() -> Model:
+    """Return the pusher-slider; c is that of even pressure (in MuJoCo the corners carry)."""
     return Model(
-        name=name,
+        name="pusher-slider",
         states={"px": "m", "py": "m", "bx": "m", "by": "m", "byaw": "rad"},
         inputs={"vx": "m/s", "vy": "m/s"},
-        params=params,
-        derivative=dynamics,
+        params={
+            "k": Param(20.0, "1/s", 5.0, 60.0),
+            "c": Param(0.038, "m", 0.02, 0.1),
+            "mu": Param(0.3, "", 0.1, 1.0),
+        },
+        derivative=slider_dynamics,
     )
 
 
-def slider_model() -> Model:
-    """Return the pusher-slider; c is that of even pressure (in MuJoCo the corners carry)."""
-    params = {
-        "k": Param(20.0, "1/s", 5.0, 60.0),
-        "c": Param(0.038, "m", 0.02, 0.1),
-        "mu": Param(0.3, "", 0.1, 1.0),
-    }
-    return model("pusher-slider", slider_dynamics, params)
-
-
-def normal_model() -> Model:
-    params = {"k": Param(20.0, "1/s", 5.0, 60.0), "c": Param(0.002, "m^2", 0.0005, 0.01)}
-    return model("pushed block", normal_dynamics, params)
-
-
-def task(crude: Model) -> Task:
+def task() -> Task:
     """Return the task: forward by 0.3 m with a turn of a quarter radian, in 2.5 s."""
     t = 0.05 * np.arange(61)
     block = minimum_jerk(np.zeros(3), np.array([0.3, 0.04, 0.25]), t / 2.5)
     return task_of(
-        crude,
+        model(),
         0.05,
         np.hstack([np.full((61, 2), np.nan), block]),
         np.zeros(5),
@@ -160,18 +108,14 @@ def task(crude: Model) -> Task:
     )
 
 
-def setup(kind: str, **what: float) -> tuple[Task, Robot, Task]:
-    """Return the task of "plane" or "axes", the robot, and the task planned in MuJoCo.
+def setup(**what: float) -> tuple[Task, Robot, Task]:
+    """Return the task, the robot, and the task planned in MuJoCo.
 
     Velocities, the block's height and tilt are not measured.
     """
     from grounded.adapters import mujoco
 
-    if kind == "plane":
-        asked = task(slider_model())
-        xml = PLANE.format(**{"mass": 0.5, "floor": 0.35, "tip": 0.4} | what)
-    else:
-        asked, xml = task(normal_model()), AXES.format(**{"mass": 0.5} | what)
+    asked, xml = task(), PLANE.format(**{"mass": 0.5, "floor": 0.35, "tip": 0.4} | what)
     truth = mujoco.model(xml)
     robot = Robot(MujocoRobot(xml, np.zeros(truth.n), columns=list(range(5))))
     return asked, robot, with_true_model(asked, truth)

@@ -74,8 +74,8 @@ def shipped(
     return Setup(name, withheld, task, Robot(simulator, delay, scatter), truth, cause)
 
 
-def block(name: str, withheld: str, kind: str, **what: float) -> Setup:
-    return Setup(name, withheld, *pushing.setup(kind, **what))
+def block(name: str, withheld: str, **what: float) -> Setup:
+    return Setup(name, withheld, *pushing.setup(**what))
 
 
 def cessna(name: str, withheld: str, **what: float) -> Setup:
@@ -113,8 +113,7 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "arm7": (arm7, "nothing", {}),
     "arm7-payload": (arm7, "payload 1.4 kg", {"payload": 1.5}),
     "arm7-friction": (arm7, "joint friction 1 N m", {"friction": 1.0}),
-    "block": (block, "inertia, contact, pressure, friction", {"kind": "plane"}),
-    "block-axes": (block, "inertia, contact, dry friction by axis", {"kind": "axes"}),
+    "block": (block, "inertia, contact, pressure, friction", {}),
     "cessna": (cessna, "sideslip, speed, engine", {}),
     "cessna-wind": (cessna, "the same and a cross-wind of 3 m/s", {"wind": 3.0}),
     "drift-car-3": (car, f"{SLIP}, 3.2 m/s2", {"kind": "drift", "acceleration": 3.2}),
