@@ -26,8 +26,9 @@ from typing import (
 
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import RulerRow
-from grounded.diagnosis.parts import Diagnosis
-from grounded.findings import Finding, Quantity
+from grounded.diagnosis.parts import Diagnosis, Verdict
+from grounded.errors import NextCommand
+from grounded.findings import Finding
 from grounded.findings.catalogue import Entry
 from grounded_trials.logs.recover import Recovery
 from grounded_trials.logs.signal_report import SignalReport
@@ -55,26 +56,6 @@ class Command(TypedDict):
 
     command: str
     arguments: list[str]
-
-
-class FindingJson(TypedDict):
-    """What a command tells."""
-
-    code: str
-    weight: str
-    about: list[str]
-    facts: dict[str, Any]
-    nats: float
-    sentence: str
-    then: Command | None
-
-
-class QuantityJson(TypedDict):
-    """A fact with a unit."""
-
-    value: float
-    std: float
-    unit: str
 
 
 class TriedJson(TypedDict):
@@ -279,15 +260,12 @@ DOCUMENTS: dict[str, Any] = {
     "target": Drawn,
     "verify": Verified,
 }
-_AS = {
-    Finding: FindingJson,
-    Quantity: QuantityJson,
-    Proposed: ProposeJson,
-}  # types that are written in another form
-_MORE: dict[str, dict[str, Any]] = {  # what a document has beside its fields
-    "Diagnosis": {"next_trial": str, "unknowable": list[str]},
-    "Verdict": {"sentence": str},
-    "Finding": {"finding": str},
+_AS = {NextCommand: Command, Proposed: ProposeJson}  # types that are written in another form
+_MORE: dict[type, dict[str, Any]] = {  # what a document has beside its fields
+    Diagnosis: {"next_trial": str, "unknowable": list[str]},
+    Verdict: {"sentence": str},
+    Fault: {"finding": str},
+    Finding: {"sentence": str},
 }
 _LATE = {"SignalReport": SignalReport}  # what a module imports for its types alone
 _PLAIN = {str: "string", Path: "string", bool: "boolean", int: "integer", NoneType: "null"}
@@ -336,7 +314,7 @@ def _object(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
         needed = [name for name, hint in hints.items() if get_origin(hint) is not NotRequired]
         found = {name: _of(_bare(hint), known) for name, hint in hints.items()}
     else:
-        assert is_dataclass(kind)
+        assert isinstance(kind, type) and is_dataclass(kind)
         found = {}
         for one in fields(kind):
             if key := one.metadata.get("key", one.name):
@@ -347,7 +325,7 @@ def _object(kind: Any, known: dict[str, Any]) -> dict[str, Any]:
         for key in getattr(kind, "ALSO", ()):
             found[key] = _of(get_type_hints(getattr(kind, key).fget)["return"], known)
             needed.append(key)
-        for key, more in _MORE.get(str(getattr(kind, "__name__", "")), {}).items():
+        for key, more in _MORE.get(kind, {}).items():
             found[key] = _of(more, known)
             needed.append(key)
     return {"type": "object", "properties": found, "required": needed}
