@@ -37,7 +37,7 @@ class Quantity:
         return {"value": finite[0], "std": finite[1], "unit": self.unit}
 
 
-Fact = Quantity | float | int | str | tuple[str, ...]
+Fact = Quantity | bool | float | int | str | tuple[str, ...]
 
 
 @dataclass(frozen=True)
