@@ -33,14 +33,6 @@ AXES = ("x", "y", "z")
 WORLD = "world_velocity"  # an Odometry's velocity, turned from the robot's axes into its pose's
 LENGTH_LIMIT = 1000  # characters in a path
 
-_INSTEAD = {  # of functions that can't be used: what can
-    "delta": "a measured or estimated state",
-    "derivative": "a measured or estimated state",
-    "timedelta": "a signal",
-    "quat": "a field of the orientation",
-    "rpy": ".@rpy.roll, .@rpy.pitch or .@rpy.yaw",
-    WORLD: f".@{WORLD}.x, .@{WORLD}.y or .@{WORLD}.z",
-}
 _PARTS = {"rpy": ANGLES, WORLD: AXES}  # functions that give several numbers, and their names
 
 
@@ -194,8 +186,9 @@ def _function(text: str, at: int, seen: re.Match[str]) -> tuple[Function, int]:
         if part[1] not in _PARTS[name]:
             _fail(text, end, f"{' or '.join(_PARTS[name])}, not '{part[1]}'")
         return Function(part[1]), part.end()
-    if name in _INSTEAD:
-        _fail(text, at, f"{_INSTEAD[name]}, not '@{name}'")
+    if name in _PARTS:
+        wanted = " or ".join(f"@{name}.{one}" for one in _PARTS[name])
+        _fail(text, at, f"{wanted}, not '@{name}'")
     if name in BINARY:
         value = float(given) if given and re.fullmatch(_NUMBER, given) else math.nan
         if not math.isfinite(value) or (name == "div" and value == 0):
