@@ -16,9 +16,8 @@ from grounded_trials.plain_file import read_file
 from grounded_trials.store.documents import read_document
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import Lost
-from grounded_trials.workspace.candidates.handover import intact
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import Noted, noted, sha256
+from grounded_trials.workspace.identity import Noted, candidate_of, noted, sha256
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 
 Check = tuple[Path, Callable[[], Any]]
@@ -73,7 +72,7 @@ def _candidates(workspace: Folder, known: Noted, gone: set[str]) -> Iterator[Che
         if not path.exists() and any(carried):  # a trial contains the file
             return
         data = read_file(path, FILE_LIMIT, follow=False)
-        lost = sorted({*intact(data, path.stem)[0].seen} - stored)
+        lost = sorted({*candidate_of(data, path.stem)[0].seen} - stored)
         if lost:
             raise refused("file.changed", path, what="gone", lost=tuple(lost))
         if handed and sha256(data) not in handed:

@@ -10,7 +10,7 @@ changed since a candidate was proposed, so everything is checked again:
     the task      the task hash; another task's candidate is only exported, if a trial ran it
     [limits]      the policy's own limits, and what it sends and holds, are inside the current ones
     the model     a candidate that no trial ran is void once the model was changed
-    [safety]      the predicted run, predicted again if the model was changed
+    [safety]      the predicted run; if the model was changed since, the runs of it
 """
 
 from __future__ import annotations
@@ -28,7 +28,6 @@ from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.policy import Policy
-from grounded.rollout import seen_late, simulate
 from grounded.search.candidate import Candidate
 from grounded.search.difference import in_question
 from grounded.search.feedback import limit_cycle
@@ -47,7 +46,6 @@ if TYPE_CHECKING:
 
 INSPECT = NextCommand("inspect", ("LOG",))  # lists what [log] may map
 PROPOSE = NextCommand("propose")
-AGREES = 1e-6  # tolerance, relative to an input's size, for a policy to repeat its prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +101,7 @@ def checked_candidate(
             [log] lacks an input or counts a delay twice, unless `anyway`.
     """
     data = workspace.candidate_bytes(identity)
-    candidate, meta = intact(data, identity)
+    candidate, meta = candidate_of(data, identity)
     check = Check(workspace, candidate, meta, other_task, now)
     check.refuse_foreign(sha256(data))
     if not anyway:
@@ -159,44 +157,6 @@ def _note(workspace: Folder, identity: str, data: bytes) -> None:
         if os.access(workspace.folder, os.W_OK):
             raise
     vars(workspace).pop("noted", None)
-
-
-def intact(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """Read a candidate and check that its policy sends the inputs that it predicts.
-
-    That check finds rewritten files that have no checksum, or a recomputed one.
-
-    Args:
-        data: the contents of the file.
-        identity: the name of the file, such as c0003.
-
-    Returns:
-        The candidate and the metadata of its file.
-
-    Raises:
-        GroundedError: if it is damaged, rewritten or renamed.
-    """
-    candidate, meta = candidate_of(data, identity)
-    predicted, policy = candidate.predicted_inputs, candidate.policy
-    true, steps = candidate.predicted_states[:-1], candidate.sample_age / policy.dt
-    with np.errstate(all="ignore"):
-        seen = true + seen_late(true, steps, policy.angles)
-        sent = policy.commands(seen[None], policy.past, predicted[None])
-        off = np.abs(sent[0] - predicted)
-        wrong = off > AGREES * (1 + np.abs(predicted).max(axis=0))
-    if wrong.any():
-        t, j = (int(i) for i in np.argwhere(wrong)[0])
-        raise GroundedError(
-            found(
-                "file.changed",
-                f"candidates/{identity}.mcap",
-                then=NextCommand("propose"),
-                what="candidate",
-                lost=f"at t = {t * policy.dt:g} s it sends {policy.input_names[j]} = "
-                f"{sent[0, t, j]:g}, but its own prediction has {predicted[t, j]:g}",
-            )
-        )
-    return candidate, meta
 
 
 @dataclass(frozen=True)
@@ -357,12 +317,6 @@ class Check:
         return self.candidate.model != self.workspace.planner.fingerprint
 
     @property
-    def _predictable(self) -> bool:
-        """Whether the run can be predicted in the current task: it has the same time grid."""
-        policy, task = self.candidate.policy, self.workspace.task
-        return policy.horizon == task.horizon and abs(policy.dt - task.dt) <= 1e-9
-
-    @property
     def _ever_ran(self) -> bool:
         return any(one.trial.candidate == self.candidate.id for one in self.trials)
 
@@ -371,35 +325,20 @@ class Check:
         return [t for t in found if self.workspace.fits(t)]
 
     def _unsafe(self) -> tuple[Finding, ...]:
-        """Return objections of [safety]; a step not run yet gets a margin for how runs strayed."""
-        workspace, made = self.workspace, self.candidate
-        if self._changed and self._predictable:
-            made = self._predicted()
-        strays = None
-        if self._predictable and not self._trials(made.id):
-            strays = spread(workspace.task, self.standing.history, made.model)
-        return objections(workspace.task, made, strays)
+        """Return objections of [safety]; a step not run yet gets a margin for how runs strayed.
 
-    def _predicted(self) -> Candidate:
-        """Predict the candidate with the current model, grounded on its trials or its base's."""
-        from grounded.solve.bias import ground
-
-        planner, made = self.workspace.planner, self.candidate
-        plan, horizon = planner.engaged, planner.task.horizon
-        problem = replace(planner.plan.problem(exact=True), age=made.sample_age)
-        for identity in (made.id, made.base):
-            ran = [t.until(horizon) for t in self._trials(identity)] if identity else []
-            whole = [t for t in ran if t.finite_steps == horizon]
-            if whole:
-                own = planner.lift(mean_trial(whole, planner.task.model.angle_mask))
-                matched = self.workspace.config.search.match_inputs
-                shift = ground(plan, own, match_inputs=matched).shift
-                engaged = replace(plan.problem(exact=True), age=made.sample_age)
-                problem = ground(plan, own, exact=True, shift=shift).on(engaged)
-                break
-        run = simulate(problem, planner.widened(made.policy))
-        states = run.states[:, : planner.task.model.n]
-        return replace(made, predicted_states=states, predicted_inputs=run.inputs)
+        If the model was changed since it ran, its runs count instead of the prediction.
+        """
+        made, task, strays = self.candidate, self.workspace.task, None
+        same = made.policy.horizon == task.horizon and abs(made.policy.dt - task.dt) <= 1e-9
+        runs = [one.until(task.horizon) for one in self._trials(made.id)]
+        whole = [one for one in runs if one.finite_steps == task.horizon]
+        if self._changed and same and whole:
+            mean = mean_trial(whole, task.model.angle_mask)
+            made = replace(made, predicted_states=mean.states)
+        if same and not runs:
+            strays = spread(task, self.standing.history, made.model)
+        return objections(task, made, strays)
 
 
 def outside_limits(task: Task, policy: Policy) -> Iterator[Finding]:
