@@ -15,9 +15,7 @@ target and DDP does not recover. So the target is turned into a nominal run in t
 3. Simulate that policy, closed loop, in the original model: the start for DDP.
 
 The trim is solved by Levenberg-Marquardt for many steps at once, with inputs inside their limits.
-It starts from several inputs, because a stalled motor has no slope. Then every step is tried again
-with one input reset (if there are few inputs and the starts ended in different minima), and from
-the solutions of its neighbours, because a manoeuvre is continuous and bad local minima rarely are.
+It starts from several inputs, because a stalled motor has no slope, and each step keeps its best.
 
 A simulator takes milliseconds a step. There few steps are solved, each once; the inputs of the
 others are those of its own inverse dynamics, where it has them, plus interpolated corrections.
@@ -39,11 +37,8 @@ from grounded.task import Task
 
 STARTS = (0.0, 0.35, 0.7, -0.35)  # fractions of the way from the held input to its limit
 ITERATIONS, MORE = 30, 12  # of Levenberg-Marquardt: from the starts, from a solution nearby
-ROUNDS = 3  # passes over the neighbours' solutions
-RESET_EACH = 8  # inputs are reset one by one if there are at most so many
 FREE_WEIGHT = 0.3  # weight of the equations of free states, below that of prescribed ones
 KNOTS = 250  # steps that are solved from scratch; the others start from their neighbours
-ALIKE = 1e-3  # relative difference of errors below which two results are the same minimum
 FEW_KNOTS, FEW_STARTS = 12, 2  # KNOTS and STARTS of a simulator
 EXACT_OF_SIMULATOR = 1e-2  # EXACT for a simulator
 EXACT = 1e-12  # squared error, relative to the mean squared rate, at which a trim is accepted
@@ -140,7 +135,7 @@ def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
     some, each = _distinct(x, knots) if simulated else (knots, np.arange(len(knots)))
     known_inputs = _inverse(task, x)
     starts = _starts(task, known_inputs, some)
-    coarse = _from_scratch(task, batch, x[some][:, free], some, starts)
+    coarse = _from_scratch(batch, x[some][:, free], some, starts)
     w = coarse.w[each]
     at, base = np.arange(H), np.zeros((H, w.shape[1]))
     if known_inputs is not None:
@@ -216,40 +211,15 @@ def _starts(task: Task, known: Array | None, knots: Rows) -> list[Array]:
 
 
 def _from_scratch(
-    task: Task, batch: LeastSquares, states: Array, knots: Rows, starts: Sequence[Array]
+    batch: LeastSquares, states: Array, knots: Rows, starts: Sequence[Array]
 ) -> Minimum:
-    """Solve from several inputs, then with one input reset, then from neighbouring solutions."""
+    """Solve from several inputs; each step keeps its best solution."""
     best = solve(batch, np.hstack([states, starts[0]]), knots, ITERATIONS)
-
-    def again(w: Array, iterations: int, wanted: NDArray[np.bool_]) -> tuple[Minimum, Array]:
-        """Return the better solutions, and the errors reached from w (inf where not tried)."""
-        reached = np.full(len(knots), np.inf)
-        open_ = np.flatnonzero((best.error > batch.solved) & wanted)
-        if not len(open_):
-            return best, reached
-        other = solve(batch, w[open_], knots[open_], iterations)
-        reached[open_] = other.error
-        return best.better_of(other, open_), reached
-
-    everywhere = np.ones(len(knots), dtype=bool)
-    ends = [best.error]
     for start in starts[1:]:
-        best, reached = again(np.hstack([states, start]), ITERATIONS, everywhere)
-        ends.append(reached)
-    differ = ~(np.max(ends, axis=0) <= (1 + ALIKE) * best.error)
-    resets = task.model.m if task.model.m <= RESET_EACH and not task.model.system.simulated else 0
-    for j in range(resets):
-        for start in starts:
-            w = best.w.copy()
-            w[:, states.shape[1] + j] = start[:, j]
-            best, _ = again(w, MORE, differ)
-    tried: dict[int, Array] = {}
-    for _ in range(ROUNDS):
-        for shift in (1, -1):
-            w = np.roll(best.w, shift, axis=0)
-            new = (w != tried[shift]).any(axis=1) if shift in tried else everywhere
-            tried[shift] = w
-            best, _ = again(w, MORE, new)
+        open_ = np.flatnonzero(best.error > batch.solved)
+        if len(open_):
+            w = np.hstack([states, start])[open_]
+            best = best.better_of(solve(batch, w, knots[open_], ITERATIONS), open_)
     return best
 
 
