@@ -37,7 +37,7 @@ from grounded.trial import Trial
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 BETTER = 3.0  # factor by which its share must fall to be mended
 OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
-TURNED_AWAY = np.deg2rad(20)  # more than side slip
+TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
@@ -180,12 +180,13 @@ class _ByRows:
         return [self._together(some) for some in found.values()]
 
     def _together(self, some: Mapping[int, _Best]) -> Told:
-        """Return one account of several trials; an offset is their mean."""
+        """Return one account of several trials; an offset is their mean, or a right angle."""
         (first, best), *_ = some.items()
         account, moved = best.account, None
         if account.fitted:
-            mean = np.mean([np.exp(1j * b.account.offset) for b in some.values()])
-            account = replace(account, offset=float(np.angle(mean)))
+            turn = float(np.angle(np.mean([np.exp(1j * b.account.offset) for b in some.values()])))
+            right = float(np.rint(turn / (np.pi / 2)) * np.pi / 2)
+            account = replace(account, offset=right if abs(turn - right) < SNAPPED else turn)
         if account.kind == "dead":
             j, x = account.columns[0], self.trials[first].states
             i = next(row.i for row in self.rows if j in row.by and row in self.each[first])

@@ -275,8 +275,8 @@ def rows_of(
     if fed:
         some += _fitted(task.model, own, trial, scales, logged)
         some += _smoothed(task.model, own, trial)
-    some += [*_clipped(own, trial), *_held(own, trial)]
-    return [*some, *(_later(own, trial, waits) if waits is not None else ())]
+    some += _clipped(own, trial)
+    return [*some, *(_held(own, trial) if waits is None else _later(own, trial, waits))]
 
 
 def _passed(

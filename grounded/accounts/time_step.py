@@ -133,9 +133,9 @@ def judge_resolution(
     for k, (trial, x) in enumerate(zip(trials, states, strict=True)):
         once, twice = (after_a_step(model, x[:-1], trial.inputs, trial.dt, n) for n in (1, 2))
         off = np.abs(model.difference(once, twice)) / np.where((usual > 0) & own, usual, np.inf)
-        if (odd := np.nan_to_num(off) > MISSES).any():
-            keep = int(odd.any(axis=1).argmax())
-            cut[k] = keep, int(odd[keep].argmax())
+        if (off := np.nan_to_num(off)).max(initial=0.0) > MISSES:
+            keep = int((off.max(axis=1) > MISSES).argmax())
+            cut[k] = keep, int(off[keep].argmax())
     for k, (keep, worst) in cut.items() if 2 * len(cut) < len(trials) else ():
         (name, unit), trial = list(model.states.items())[worst], trials[k]
         said = told.found(

@@ -101,14 +101,11 @@ class Case:
         workspace: the workspace with the candidates.
         path: the log, for messages.
         read: what it contains: the trial that would be stored.
-        named: the candidate that the user named, if any.
         log: the log in which its commands are judged; None if `read` was written by grounded.
     """
 
-    def __init__(
-        self, workspace: Folder, path: Path, read: Read, named: str | None, log: ForeignLog | None
-    ) -> None:
-        self.workspace, self.path, self.named, self.task = workspace, path, named, workspace.task
+    def __init__(self, workspace: Folder, path: Path, read: Read, log: ForeignLog | None) -> None:
+        self.workspace, self.path, self.task = workspace, path, workspace.task
         self.read, self.ran = read, read.trial.candidate
         self.own, _ = workspace.candidate(self.ran)
         candidates, self.earlier = _may_have_run(workspace)
@@ -192,21 +189,13 @@ class Case:
 
     @cached_property
     def as_logged(self) -> Story:
-        """The story of a log that is as it should be: the rival's that evidence names, or nobody's.
-
-        Candidates that are nearly the same send nearly the same on exchanged columns, too.
-        """
-        log, rival, why, kind = self.log, self.rival, self.seen.why, Kind.CANDIDATE
+        """The story of a log that is as it should be: of the rival by evidence, or of nobody."""
+        rival, why = self.rival, self.seen.why
         if rival is None:
             error = self.seen.ran.error if self.seen.ran else 1.0
             return scored(Kind.UNKNOWN, why, self.own, self.whole, error)
-        kind = Kind.EARLIER if rival in self.earlier else kind
-        start = self.start_of(rival)
-        run = log.trial_from(start.seconds) if log and start and start.alike else None
-        fit = run and follows(rival.policy, run.until(rival.policy.horizon), 0)
-        if run and fit:
-            return scored(kind, why, rival, run, fit.error, names=(rival.id,))
-        return Story(kind, why, commands=-np.inf, names=(rival.id,))
+        kind = Kind.EARLIER if rival in self.earlier else Kind.CANDIDATE
+        return Story(kind, why, names=(rival.id,))
 
     @cached_property
     def columns(self) -> list[Finding]:
@@ -255,17 +244,18 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
         logs.append(late)
-    cases = [Case(workspace, path, read, candidate, log) for log in logs]
+    cases = [Case(workspace, path, read, log) for log in logs]
     case = min(cases, key=lambda one: one.doubt)
     read, fell = case.warned(), case.fell
     stored = read.log.stored if read.log else ()
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell[0]) if fell and fell[0] in accepted else read
-    alike = not case.seen.why
-    story = likeliest(_of_trial(case), case.as_logged)
-    if alike and story.kind is Kind.UNKNOWN:
-        return cut_short(read, *fell) if fell else read
+    story = case.as_logged
     if case.rival is None:
+        kinds = (Kind.UNIT, Kind.LOG) if case.log else (Kind.UNIT,)
+        story = likeliest((one for one in case.seen.stories if one.kind in kinds), story)
+        if not case.seen.why and story.kind is Kind.UNKNOWN:
+            return cut_short(read, *fell) if fell else read
         story = likeliest([story, *_of_log(case)], case.as_logged)
     if story.kind in (Kind.UNKNOWN, Kind.PROGRAM):  # neither says how the robot moved
         story = next(_of_motion(case, story), story)
@@ -275,18 +265,6 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     if candidate is not None:
         return _doubted(case, read, story)
     raise _refusal(case, story)
-
-
-def _of_trial(case: Case) -> Iterator[Story]:
-    """Yield the stories of a trial as it is cut, of another unit or origin of its states."""
-    if case.rival:
-        return
-    zeros = case.log and not (case.named or case.seen.why)
-    yield from (
-        one
-        for one in case.seen.stories
-        if one.kind is Kind.UNIT or (zeros and one.kind is Kind.LOG)
-    )
 
 
 def _of_log(case: Case) -> Iterator[Story]:
