@@ -178,7 +178,6 @@ def test_a_discarded_trial_counts_nowhere_until_it_is_restored(waiting):
     assert [t.stored.id for t in w.trials()] == ["t0001", "t0003"]
     assert now.discarded["t0002"] in grounded("-C", w.folder, "status").out
     assert grounded("-C", w.folder, "status", "--json").json["discarded"] == now.discarded
-    assert "aside: t0002" in grounded("-C", w.folder, "report").out
     assert len(w.store.list()) == 3 and w.verify().damaged == ()  # nothing is deleted
     assert w.restore("t0002").discarded == {}
     assert w.status().standing.utilities == before.standing.utilities
