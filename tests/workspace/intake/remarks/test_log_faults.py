@@ -20,11 +20,8 @@ def test_a_part_of_a_quaternion_is_told_wherever_it_is_read(tmp_path):
 
     def told():
         said = grounded("-C", w, "inspect", log, "--json").json["remarks"]
-        found = grounded("-C", w, "diagnose", "--instruments", "--json").json["preflight"]
-        return [any(holds(one, part, angle) for one in some) for some in (said, texts(found))]
-
-    def texts(findings):
-        return [one["finding"] for one in findings]
+        found = [one.finding for one in Workspace(w).preflight()]
+        return [any(holds(one, part, angle) for one in some) for some in (said, found)]
 
     assert not any(part in one for one in Workspace(w).ingest(log, data=True).warnings)
     assert told() == [False, False]
