@@ -378,25 +378,29 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
 
     The velocity S of a position that is late by d is off by -d S'. A slipping wheel acts along the
     path as well, a side slip or a tracked point ahead across it, a drift by a constant: beside
-    these, none may remain of the delay.
+    these, none may remain of the delay. If the sideways velocity is not measured, it must show both
+    along and across the path.
 
     Args:
         model: however crude.
         trials: of one time step, already corrected for other faults.
         both: the rows of the two positions.
     """
-    dt, columns = trials[0].dt, [row.i for row in both]
+    dt, columns, units = trials[0].dt, [row.i for row in both], list(model.states.values())
     ways = [(z[:, columns], s[:, columns]) for t in trials for z, s in per_step(model, t, both)]
     lag = lag_between([(said[:, k], moved[:, k]) for k in (0, 1) for moved, said in ways], dt)
     if lag is None or lag.sign < 0 or lag.coherence < COHERENT:
         return None
-    if lag.delay < max(REPORTED_FROM * lag.std, 0.5 * dt):
-        return None
-    late, std = _left(ways, lag.delay / dt, dt)
-    return lag if max(std, abs(late) - SURELY * std) < UNSURE * lag.delay else None
+    apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
+    least = max(REPORTED_FROM * lag.std, 0.5 * dt)
+    left = _left(ways, lag.delay / dt, dt, apart=apart) if lag.delay >= least else [(0.0, np.inf)]
+    sure = all(max(std, abs(late) - SURELY * std) < UNSURE * lag.delay for late, std in left)
+    return lag if sure else None
 
 
-def _left(ways: Sequence[tuple[Array, Array]], steps: float, dt: float) -> tuple[float, float]:
+def _left(
+    ways: Sequence[tuple[Array, Array]], steps: float, dt: float, *, apart: bool
+) -> list[tuple[float, float]]:
     """Return the delay [s] that remains after shifting positions, with its standard deviation.
 
     The plane is one of complex numbers here.
@@ -405,6 +409,7 @@ def _left(ways: Sequence[tuple[Array, Array]], steps: float, dt: float) -> tuple
         ways: displacements of each piece, measured and by the other sensors (T, 2).
         steps: by which the positions are shifted earlier.
         dt: time step [s].
+        apart: estimate the delay along the path and across it separately.
     """
     h, rows = max(3, round(SMOOTH_S / dt)), list[Array]()
     window = np.hanning(2 * h + 3)[1:-1]
@@ -416,18 +421,22 @@ def _left(ways: Sequence[tuple[Array, Array]], steps: float, dt: float) -> tuple
             continue
         z, s = (np.convolve(one[known], window, "valid") for one in (early, said @ [1, 1j]))
         # a late position, beside slip along and across the path and a point ahead or aside
-        slope, ahead = np.gradient(s, dt), s / np.maximum(np.abs(s), 1e-9)
-        turn = (slope * ahead.conj()).imag / np.maximum(np.abs(s), 1e-9)
-        columns = [z - s, -slope, turn * 1j * ahead, -turn * ahead, ahead, 1j * ahead]
+        size = np.maximum(np.abs(s), 1e-9)
+        ahead = s / size
+        slope = np.gradient(s, dt) * ahead.conj()
+        turn, side = slope.imag / size, 1j * ahead
+        late = [slope.real * ahead, slope.imag * side] if apart else [slope * ahead]
+        columns = [z - s, *(-one for one in late), turn * side, -turn * ahead, ahead, side]
         centred = np.stack(columns, axis=1)
         centred -= centred.mean(axis=0)
         rows += [centred.real, centred.imag]
     every = np.concatenate(rows) if rows else np.zeros((0, 2))
     rest, design = every[:, 0], every[:, 1:]
     if len(rest) < 16 or np.linalg.matrix_rank(design) < design.shape[1]:
-        return 0.0, np.inf
+        return [(0.0, np.inf)]
     spread = np.linalg.inv(design.T @ design)
     found = spread @ design.T @ rest
     forces = design * (rest - design @ found)[:, None]
     parts = np.stack([part.sum(axis=0) for part in np.array_split(forces, 32)])
-    return float(found[0]), float(np.sqrt((spread @ parts.T @ parts @ spread)[0, 0]))
+    stds = np.sqrt(np.diag(spread @ parts.T @ parts @ spread))
+    return [(float(found[k]), float(stds[k])) for k in range(1 + apart)]
