@@ -22,9 +22,10 @@ class Uniforms:
 
     def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
         self.graph = graph
-        live = graph.live(outputs)
-        varying = {i for i in live if graph.varies(i)}
-        read = [i for i in _frontier(graph, live, varying, outputs) if graph.nodes[i].op != "const"]
+        varying = [graph.nodes[i] for i in graph.live(outputs) if graph.varies(i)]
+        used = {a for node in varying for a in node.args}.union(outputs)  # or wanted themselves
+        uniform = (i for i in sorted(used) if not graph.varies(i))
+        read = [i for i in uniform if graph.nodes[i].op != "const"]
         self.slot = {i: FIRST + place for place, i in enumerate(read)}
 
     @property
@@ -49,14 +50,6 @@ class Uniforms:
             f.store(body.value(i), "%table", slot)
         f.do("ret void")
         return f.text()
-
-
-def _frontier(
-    graph: Graph, live: Sequence[int], inside: set[int], outputs: Sequence[int]
-) -> list[int]:
-    """Nodes outside a set that are used by it, or are wanted themselves."""
-    used = {a for i in live if i in inside for a in graph.nodes[i].args} | set(outputs)
-    return sorted(used - inside)
 
 
 class Body:
