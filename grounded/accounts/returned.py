@@ -26,6 +26,7 @@ from grounded.accounts.sent import (
     DECISIVE,
     EXPLAINED,
     FINE,
+    SAME,
     SLIGHT,
     STEPS_TO_JUDGE,
     Following,
@@ -596,8 +597,9 @@ def suspicion(
     rivals = [(follows(c.policy, trial, late), c.id) for c in others[-OTHERS:] if c.id != own.id]
     alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]
     if sure := [one for one in alike if one[2] > DECISIVE]:
-        _, name, nats = min(sure)
-        return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), name)
+        left, name, nats = min(sure)
+        near = name if left < max(CLEAR, SAME * ran.error) else ""
+        return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
     some = cache(partial(stories, task, own, trial, ran, logged=logged))
     if ran.alike:
         return Suspicion(ran, asked=some)
