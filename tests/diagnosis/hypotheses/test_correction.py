@@ -64,14 +64,15 @@ def kept(folder, **changes):
     write_document(folder / "reports" / "diagnosis.json", found.to_json())
 
 
-def test_a_correction_is_adopted_as_part_of_the_model(workspace_of):
+@pytest.mark.parametrize("asked", ["correction:v", "correction:v<-x"])
+def test_a_correction_is_adopted_as_part_of_the_model(workspace_of, asked):
     workspace = Workspace(workspace_of().folder)
     workspace.learn(trials=2)
     kept(workspace.folder, adoptable=False)
     with pytest.raises(GroundedError, match="does not predict"):
-        workspace.adopt("correction:v")
+        workspace.adopt(asked)
     kept(workspace.folder)
-    done = workspace.adopt("correction:v")
+    done = workspace.adopt(asked)
     names = [effect["name"] for effect in done.effects]
     assert names == ["correction:v<-x", "correction:v<-force"] and done.claimed
     again = Workspace(workspace.folder)

@@ -295,14 +295,14 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
 
 
 def _with_curves(diagnosis: Diagnosis, names: list[str]) -> list[str]:
-    """Replace `correction:v` by its curves.
+    """Replace `correction:v`, or some of its curves, by all of them.
 
     Raises:
         GroundedError: if the correction is not adoptable, or claimed effects are not adopted too.
     """
     one, curves = diagnosis.correction, _curves(diagnosis)
     asked = [n for n in names if n.startswith("correction:")]
-    if one is None or asked not in ([f"correction:{one.channel}"], curves):
+    if one is None or not asked or not {*asked} <= {f"correction:{one.channel}", *curves}:
         return names
     if not one.adoptable:
         raise refused("model.not_adoptable", asked[0], why="worse")
