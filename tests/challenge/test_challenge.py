@@ -42,7 +42,7 @@ def test_no_file_of_a_case_holds_the_answer(made):
         family = truth.split(":")[0]
         for path in (folder / name).rglob("*"):
             if path.is_file():
-                assert family.encode() not in path.read_bytes(), path
+                assert truth.encode() not in path.read_bytes(), path
 
 
 def test_a_label_that_was_changed_is_not_opened(made, tmp_path):
