@@ -39,7 +39,6 @@ def test_no_file_of_a_case_holds_the_answer(made):
     folder, labels, document = made
     for name in document["cases"]:
         truth = json.loads((labels / f"{name}.json").read_text())["effects"][0]["effect"]
-        family = truth.split(":")[0]
         for path in (folder / name).rglob("*"):
             if path.is_file():
                 assert truth.encode() not in path.read_bytes(), path
