@@ -374,8 +374,7 @@ def verify() -> None:
 def demo() -> None:
     """Run a whole example in a new folder: learn, diagnose, report.
 
-    `grounded init --list` lists the examples. The optimum is found afterwards with the TRUE model,
-    which the search never sees.
+    `grounded init --list` lists the examples.
     """
 
 

@@ -20,10 +20,8 @@ from grounded_cli.console.workspace import located, next_line
 from grounded_cli.learn import narrated
 from grounded_cli.status import summary
 from grounded_trials import Workspace
-from grounded_trials.report.reporting import save_optimum
 from grounded_trials.starting.examples import example
 from grounded_trials.wording import count
-from grounded_trials.workspace.candidates.running import optimum
 
 STEPS = 1200  # steps of the trials that are diagnosed, so that a demo ends within a minute or two
 EFFECTS_SOUGHT = 3  # effects that are looked for if there are more: each more takes 20 s
@@ -39,9 +37,6 @@ def demo(name: str, folder: str | None) -> Iterator[dict[str, Any]]:
     located(click.get_current_context(), None, str(target))  # for the commands in its texts
     say(f"{target}: {name}\n")
     status = narrated(workspace)
-    with progress("optimum"):
-        best = optimum(workspace)
-    save_optimum(workspace, best)
     some, most = _few(status.standing, STEPS // workspace.task.horizon), None
     if len(some) < status.standing.trials:
         most = EFFECTS_SOUGHT
@@ -64,8 +59,6 @@ def demo(name: str, folder: str | None) -> Iterator[dict[str, Any]]:
     first, last = status.standing.utilities[0], status.standing.utilities[-1]
     gain = f"{percent(1 - last / first)} better after {count(trials, 'trial')}"
     show("\n" + field("learned", f"{number(first)} at first, {number(last)} now: {gain}"))
-    if best is not None:
-        show(field("optimum", f"{number(best)}, by the true model"))
     verdict = [sentence(one) for one in told(diagnosed).lines]
     if len(some) < trials:
         verdict.append(f"Diagnosed: {len(some)} of {trials} trials.")

@@ -1,4 +1,4 @@
-"""Figures of a search: utility and predicted utility by candidate, and the step sizes."""
+"""The figure of a search: utility and predicted utility by candidate."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.figures.figure import Dot, Figure, Key, Panel, Trace, band, curve, panel, rule
+from grounded.figures.figure import Dot, Figure, Key, Panel, Trace, band, curve, panel
 from grounded.result import figure
 from grounded.search.candidate import Tried
 
@@ -25,21 +25,15 @@ OPEN = {  # labels of undecided verdicts
 }
 
 
-def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
-    """Draw the utility of each candidate with the model's prediction, and the step sizes.
-
-    Args:
-        now: the standing of the search.
-        optimum: best possible utility on the real system, if known.
-    """
+def search_figure(now: Standing) -> Figure | None:
+    """Draw the utility of each candidate with the model's prediction."""
     shown, left = few(now.history, MOST_DRAWN)
     tried = [t for t in shown if t.utilities]
     if not tried:
         return None
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
     waits = [t for t in shown if not t.utilities and now.verdict(t) == "waiting"]
-    whole = _utility(now, tried + waits, number, optimum)
-    panels = (whole, _steps(now, shown, number))
+    whole = _utility(now, tried + waits, number)
     unsure = any(now.verdict(t) == "maybe better" for t in shown)
     key = [
         Key("best", f"first{', maybe better' * unsure} or better", "disc"),
@@ -50,8 +44,6 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
     ]
     if any(not math.isfinite(t.utility) for t in tried):
         key.append(Key("model", "crashed", "cross"))
-    if optimum is not None:
-        key.append(Key("accepted", "optimum of the real system"))
     if any(shape["type"] == "rect" for shape in whole.layout["shapes"]):
         key.append(Key("other", "±2 standard errors of the best", "band"))
     stepped = any(t.candidate.grounded for t in shown)
@@ -61,7 +53,7 @@ def search_figure(now: Standing, optimum: float | None = None) -> Figure | None:
         + "; for all but the first candidate, it replays an earlier trial" * stepped
         + "."
     ) + f" {left} candidates in between are not drawn." * bool(left)
-    return Figure("utility", "Utility", caption, panels, tuple(key))
+    return Figure("utility", "Utility", caption, (whole,), tuple(key))
 
 
 def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
@@ -82,15 +74,10 @@ def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
     return [history[k] for k in sorted(keep)], len(history) - len(keep)
 
 
-def _utility(
-    now: Standing, tried: list[Tried], number: dict[str, int], optimum: float | None
-) -> Panel:
+def _utility(now: Standing, tried: list[Tried], number: dict[str, int]) -> Panel:
     dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
     shapes = list[Trace]()
     values = [d.y for d in dots if math.isfinite(d.y)]
-    if optimum is not None:
-        shapes.append(rule(optimum, "accepted", "optimum"))
-        values.append(optimum)
     best = now.incumbent
     if best is not None and 0 < best.standard_error < math.inf:
         error = 2 * best.standard_error
@@ -162,29 +149,3 @@ def _undecided(verdicts: Sequence[str]) -> list[Key]:
     """Return the legend entry for undecided candidates; empty if there are none."""
     names = [words for verdict, words in OPEN.items() if verdict in verdicts]
     return [Key("predicted", " or ".join(names), "ring")] if names else []
-
-
-def _steps(now: Standing, shown: list[Tried], number: dict[str, int]) -> Panel:
-    """Draw the damping of each step, or alpha if a step was shortened or none was damped."""
-    steps = [t for t in shown if t.candidate.iteration > 0]  # not the model's own policy
-    damped = any(t.candidate.damping > 0 for t in steps)
-    damped &= all(t.candidate.alpha == 1 for t in steps)
-    dots = []
-    for t in steps if damped else shown:
-        c = t.candidate
-        shape, role = _look(t, now.verdict(t))
-        note = f"{c.id}: α = {c.alpha:g}, damping {figure(c.damping, 2)}"
-        size = math.log10(max(c.damping, 1e-12)) if damped else math.log2(max(c.alpha, 2.0**-30))
-        dots.append(Dot(number[c.id], size, role, note, shape))
-    low, high = (end(d.y for d in dots) for end in (min, max))
-    title = "Step size: log₂ α (0: full step, −1: half)"
-    return panel(
-        "Step size: log₁₀ damping (higher: more cautious)" if damped else title,
-        "candidate",
-        "log₁₀ damping" if damped else "log₂ α",
-        (),
-        dots,
-        x_ticks=_named(shown, number),
-        whole=True,
-        y_range=(low - 0.5, high + 0.5) if damped else (min(low, -1.0) - 0.4, 0.6),
-    )

@@ -14,7 +14,7 @@ __all__ = ["cart"]
 
 
 @pytest.mark.slow
-def test_demo_prints_utilities_trials_and_the_optimum(tmp_path, monkeypatch):
+def test_demo_prints_utilities_and_trials(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     there = find_spec  # no recording without rerun
     monkeypatch.setattr(
@@ -23,9 +23,8 @@ def test_demo_prints_utilities_trials_and_the_optimum(tmp_path, monkeypatch):
     done = grounded("demo", "pendulum", "--json")
     assert done.code == 0, done.err
     found = done.json
-    assert {"workspace", "utilities", "verdict", "trials", "optimum"} <= set(found)
+    assert {"workspace", "utilities", "verdict", "trials"} <= set(found)
     assert found["utilities"][-1] > 0.65 * found["utilities"][0]
-    assert found["optimum"] >= found["utilities"][-1] - 1e-3 * abs(found["optimum"])
     folder = tmp_path / found["workspace"]
     assert (folder / "grounded.toml").is_file() and (folder / "reports").is_dir()
     assert "rrd" not in found["paths"] and found["paths"]["html"]

@@ -102,7 +102,7 @@ def test_results_plot_what_the_page_shows(cart):
     errors = RulerRow(1.0, unit_by_channel=units, crude=before, with_effects=after)
     for result, titles in (
         (replace(findings.diagnosis, prediction_error=(errors,)), ("v [m/s]",)),
-        (findings.standing, ("Utility of each candidate", "Step size")),
+        (findings.standing, ("Utility of each candidate",)),
         (findings.best.candidate, ("x", "v", "force")),
     ):
         drawn = result.plot()

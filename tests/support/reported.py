@@ -156,7 +156,6 @@ def many_flights(trials: int = 50) -> Findings:
         logs=(),
         lost=(),
         diagnosis=None,
-        optimum=None,
         then=NextCommand("propose"),
     )
 

@@ -12,7 +12,6 @@ import pytest
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
-from grounded_trials.report.reporting import save_optimum
 from grounded_trials.store.documents import proven
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from reported import cart, copied
@@ -65,14 +64,6 @@ def test_a_diagnosis_without_a_checksum_is_not_adopted(cart, tmp_path):
     path.write_text("{" + text.split(",", 1)[1])
     with pytest.raises(GroundedError, match=holding("diagnosis.json", "checksum")):
         Workspace(folder).adopt("viscous_friction:v")
-
-
-def test_a_flipped_optimum_is_not_read(w):
-    save_optimum(w, -1.5)
-    path = w.reports / "optimum.json"
-    path.write_bytes(path.read_bytes().replace(b"-1.5", b"-9.5"))
-    assert w.report().findings.optimum is None
-    assert [one.file for one in w.verify().damaged] == [str(path)]
 
 
 def test_a_deleted_trial_is_found_the_last_one_too(w, which=-1):

@@ -78,7 +78,6 @@ class Findings:
     logs: tuple[Log, ...]  # logs of this robot that ran no candidate; the latest of many
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
-    optimum: float | None  # of the real system, if a study computed it
     then: NextCommand
     better: Better | None = None  # the model as diagnosed, or with adopted effects
     since: Since = field(default_factory=Since)  # changes since the diagnosis

@@ -6,11 +6,9 @@ A damaged or missing trial is left out and listed in `lost`; the rest is still s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection
 from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -24,7 +22,6 @@ from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Log, Run, selection
 from grounded_trials.report.forecast import anchored
-from grounded_trials.store.documents import read_document
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
@@ -84,7 +81,6 @@ def gather(workspace: Folder) -> Findings:
         logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
         lost=tuple(lost),
         diagnosis=diagnosis,
-        optimum=known_optimum(workspace.reports),
         then=asked,
         better=better,
         since=since,
@@ -169,15 +165,6 @@ def _residual(planner: Planner, trial: Trial) -> Array:
         part = anchored(planner, trial.until(whole))
         residual[:whole] = residuals(planner.plan, part)[:, :n]
     return residual
-
-
-def known_optimum(reports: Path) -> float | None:
-    """Read the optimum from reports/optimum.json, {"utility": U}, which studies write."""
-    try:
-        value = float(read_document(reports / "optimum.json")["utility"])
-    except (OSError, GroundedError, ValueError, KeyError, TypeError):
-        return None
-    return value if math.isfinite(value) else None
 
 
 def _method(workspace: Folder) -> str:

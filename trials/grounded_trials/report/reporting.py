@@ -19,12 +19,11 @@ from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page import page
-from grounded_trials.store.documents import write_document
 from grounded_trials.store.store import made_folder, write_atomically
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.folder import Folder
 
-RECORDING, PAGE, OPTIMUM = "recording.rrd", "report.html", "optimum.json"
+RECORDING, PAGE = "recording.rrd", "report.html"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -60,7 +59,6 @@ class Report(Result):
             "phase": findings.standing.phase,
             "sentence": findings.outlook,
             "ending": findings.standing.ending or None,
-            "optimum": findings.optimum,
             "lost": [vars(one) for one in findings.lost],
             "next": rendered(findings.then, findings.folder),
             "model_policy": _measures(findings, findings.first),
@@ -131,9 +129,3 @@ def report_in(
         paths.append(made_folder(workspace.reports) / RECORDING)
         write_recording(findings, paths[-1])
     return Report(findings, tuple(paths))
-
-
-def save_optimum(workspace: Folder, utility: float | None) -> None:
-    """Write the optimum of the real system, known in a study, for the report; None: do nothing."""
-    if utility is not None:
-        write_document(made_folder(workspace.reports) / OPTIMUM, {"utility": utility})

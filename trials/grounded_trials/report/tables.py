@@ -108,8 +108,6 @@ def counted(findings: Findings) -> list[str]:
         found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
     if logs:
         found.append(f"{count(logs, 'log')} of data")
-    if findings.optimum is not None:
-        found.append(f"optimum {figure(findings.optimum)}")
     for left, drawn, kind in (
         (findings.left_runs, len(findings.runs), "trials"),
         (findings.left_logs, len(findings.logs), "logs"),
@@ -178,7 +176,7 @@ def _utility(findings: Findings) -> list[Block]:
     sure = gain.to_finding().sentence if gain else ""
     wide = len(findings.history) <= OPEN
     return [
-        *_drawn(search_figure(findings.standing, findings.optimum)),
+        *_drawn(search_figure(findings.standing)),
         *([Block("text", f"{begun(sure)}.")] if sure else []),
         Block("folded", "All candidates", blocks=_candidates(findings), wide=wide),
     ]

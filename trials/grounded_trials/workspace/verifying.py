@@ -87,6 +87,5 @@ def _documents(workspace: Folder) -> Iterator[Check]:
     """Yield the path of each document in reports/, with a function that checks it."""
     if (path := workspace.reports / "diagnosis.json").exists():
         yield path, lambda: read_diagnosis(workspace.reports)
-    for path in (workspace.reports / f"{n}.json" for n in ("optimum", "adoptions")):
-        if path.exists():
-            yield path, partial(read_document, path)
+    if (kept := workspace.reports / "adoptions.json").exists():
+        yield kept, partial(read_document, kept)

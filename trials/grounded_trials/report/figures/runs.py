@@ -49,7 +49,7 @@ ROUGH = 1.0  # ratio of the change from step to step to the values (rms) from wh
 def all_figures(findings: Findings) -> list[Figure]:
     """Return all figures of a report in reading order, without empty ones."""
     runs = (path_figure, state_figure, input_figure, error_figure, bias_figure)
-    made = [search_figure(findings.standing, findings.optimum), *(draw(findings) for draw in runs)]
+    made = [search_figure(findings.standing), *(draw(findings) for draw in runs)]
     if findings.diagnosis is not None:
         made += gap_figures(findings.diagnosis)
     made += forecast_figures(findings) + residual_figures(findings)

@@ -2,8 +2,6 @@
 
 The real system is a command of the user (for a robot, another simulator), which gets the paths of
 the candidate and of the trial that it must write; or it is simulated by a model in the workspace.
-For a simulated system `optimum` finds how good a candidate could get, by the same search in the
-true model; it is for studies and demos, and the search of the workspace never uses it.
 """
 
 from __future__ import annotations
@@ -21,10 +19,6 @@ from grounded.errors import NextCommand
 from grounded.findings import Finding, found
 from grounded.plant import Noise, Plant
 from grounded.result import UNSAID, Document
-from grounded.search.ask_tell import learn
-from grounded.search.candidate import Candidate
-from grounded.search.step.step_size import SearchOptions
-from grounded.trial import Trial
 from grounded.trusted import check_own
 from grounded_trials.store.store import made_folder
 from grounded_trials.store.trial_file import write_trial
@@ -35,7 +29,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
-TRIALS = 30  # limit of the search for the optimum
 EXAMPLE = "python drive.py {candidate} {trial}"  # a command of [system]
 
 
@@ -178,26 +171,3 @@ def _simulate(workspace: Folder, handed: Handed, path: Path) -> None:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
-
-
-def optimum(workspace: Folder) -> float | None:
-    """Return the best utility found with the true model.
-
-    Returns None if the system is not simulated, or if the true model has other states or inputs
-    than the crude one, so that the task does not fit it.
-    """
-    if not workspace.config.system.model:
-        return None
-    task, plant = workspace.task, replace(simulated_plant(workspace), noise=Noise())
-    model = plant.model
-    if (model.state_names, model.input_names) != (task.model.state_names, task.model.input_names):
-        return None
-    delays = np.array([plant.latency.get(name, 0.0) for name in model.input_names])
-    truth = replace(task.with_model(model), latency=delays)
-    start = dict(zip(model.state_names, map(float, task.start), strict=True))
-
-    def run(candidate: Candidate) -> Trial:
-        return plant.run(candidate.policy, start, np.random.default_rng(0))
-
-    best = learn(truth, run, SearchOptions(max_trials=TRIALS, tolerance=1e-4), check=False).best
-    return best.utility if best else None
