@@ -31,8 +31,6 @@ def recover(log: str, output: str | None) -> Iterator[Recovery]:
     for topic, number in found.messages.items():
         lost = found.lost_messages.get(topic, 0)
         show(f"  {topic}: {number}" + (f", {lost} lost" if lost else ""))
-    if found.unverified:
-        show(field("unchecked", count(found.unverified, "message")))
     show(f"\n{next_line(_next(found))}")
 
 

@@ -155,7 +155,7 @@ def test_clocks_that_jump_or_differ_are_refused() -> None:
         grid(zero)
     some = x.t.copy()
     some[:3] = 0
-    assert grid(replace(x, t=some)).reports[0].unstamped == 3
+    assert grid(replace(x, t=some)).reports[0].stamps == 3
 
 
 def test_the_span() -> None:

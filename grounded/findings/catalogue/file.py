@@ -28,7 +28,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "damaged": Entry(
         "refuse",
-        "{about}: {where} [[{what:cut=is cut off: the file ends inside it,checksum=does not match "
+        "{about}: {part} [[{what:cut=is cut off: the file ends inside it,checksum=does not match "
         "its checksum,time=is from after the year 2262}]][[!what? is damaged]][[: {why}]]"
         "[[ (at byte {byte})]]",
         "`recover` saves what can be saved",

@@ -101,7 +101,7 @@ def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]
     query = "SELECT topic_id, timestamp, data FROM messages"
     for topic, stamp, data in bag.execute(query):
         if topic not in channels:
-            raise GroundedError(found("file.damaged", str(path), where=f"channel {topic}"))
+            raise GroundedError(found("file.damaged", str(path), part=f"channel {topic}"))
         yield channels[topic], stamp, data
 
 

@@ -59,16 +59,16 @@ class DamagedFile(GroundedError):
         name: of the file.
         offset: where that was noticed [bytes].
         what: what is wrong there: `file.damaged` says it in words.
-        where: the part of the file.
+        part: of the file.
         why: the cause, if known.
         lost: whether nothing can be saved.
     """
 
     def __init__(
-        self, name: str, offset: int, what: str, where: str = "", why: str = "", lost: bool = False
+        self, name: str, offset: int, what: str, part: str = "", why: str = "", lost: bool = False
     ) -> None:
         self.offset, self.what = offset, what
-        facts: dict[str, Any] = {"what": what, "where": where, "why": why}
+        facts: dict[str, Any] = {"what": what, "part": part, "why": why}
         then = None if lost else NextCommand("recover", (name,))
         code = "file.no_message" if lost else "file.damaged"
         code = "file.no_log" if what == "other" else code
@@ -108,10 +108,10 @@ class _Walk:
         self.messages = False  # a message, or a chunk of them, has begun
 
     def damaged(
-        self, what: str, where: str = "", why: str = "", offset: int | None = None
+        self, what: str, part: str = "", why: str = "", offset: int | None = None
     ) -> DamagedFile:
         at = self.pos if offset is None else offset
-        return DamagedFile(self.name, at, what, where, why)
+        return DamagedFile(self.name, at, what, part, why)
 
     def checksum(self, start: int) -> int:
         """Return the CRC from `start` to here."""

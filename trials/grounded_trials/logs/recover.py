@@ -64,16 +64,15 @@ COMPRESSED = (b"\4\0\0\0zstd", b"\3\0\0\0lz4")  # a chunk's; then the copy is co
 
 @dataclass(frozen=True, eq=False)
 class Recovery(Document):
-    """What was saved, what was lost, and how much of it has no valid checksum."""
+    """What was saved, and what was lost."""
 
     file: Path
     messages: Mapping[str, int]  # saved, by topic
     lost_messages: Mapping[str, int]  # known to be lost, by topic
     findings: tuple[Finding, ...]  # what was lost; empty if the file was not damaged
-    unverified: int  # saved messages without a valid checksum
     duration_s: float  # from the first to the last saved message
     losses: tuple[str, ...]  # the findings in words
-    complete: bool  # nothing was lost, and everything saved is verified
+    complete: bool  # nothing was lost
     format: str = field(metadata=UNSAID, default="")  # of a file that grounded wrote
 
 
@@ -177,7 +176,6 @@ def _recover(source: Path, target: Path) -> Recovery:
             for c, n in salvage.lost_messages.items()
         },
         findings=tuple(losses),
-        unverified=salvage.unverified,
         duration_s=(last - first) * 1e-9,
         losses=tuple(one.sentence for one in losses),
         complete=not losses,
@@ -205,7 +203,6 @@ class Salvage:
         losses: what was lost.
         lost_messages: messages in dropped chunks by channel, according to the indexes.
         dropped: first and last time stated in each dropped chunk [ns].
-        unverified: number of saved messages without a valid checksum.
     """
 
     def __init__(self, data: Data) -> None:
@@ -213,10 +210,9 @@ class Salvage:
         self.losses: list[Finding] = []
         self.lost_messages: Counter[int] = Counter()
         self.dropped: list[tuple[int, int]] = []
-        self.unverified = 0
         self._crc = 0
         self._outside = 0  # messages outside checked chunks, covered only by the data checksum
-        self._tables = 0  # metadata and attachments covered only by the data checksum
+        self._tables = 0  # metadata and attachments covered only by it
         self._ended = False  # the data section has ended; only the index follows
         self._defined: dict[tuple[type, int], Schema | Channel] = {}
         self._doubtful: set[int] = set()  # channels with two different definitions
@@ -319,9 +315,7 @@ class Salvage:
         wrong = bool(stated) and stated != self._crc
         if wrong and not self.losses and (self._outside or self._tables):
             self.losses.append(found("file.lost", wrong=True, messages=self._outside))
-        if self.losses or not stated:
-            self.unverified += self._outside
-        self._outside, self._ended = 0, True
+        self._ended = True
 
     def _count_lost(self, content: bytes) -> None:
         if len(content) >= 6:
@@ -377,7 +371,6 @@ class Salvage:
 
     def _cut(self, rest: bytes) -> Iterator[Record]:
         """Yield the intact parts of the record in which the file ends."""
-        self.unverified += self._outside
         try:
             if len(rest) > 49 and rest[0] == CHUNK:
                 fields = Fields(rest[9 + 16 :])
@@ -385,7 +378,6 @@ class Salvage:
                 packed = fields.content[fields.pos + 8 :]
                 data = decompress(compression, bytes(packed), size)[0]
                 for record in list(chunk_records(data, cut=True)):
-                    self.unverified += len(record) if isinstance(record, Messages) else 0
                     yield from self._sound(record)
         except BadRecord:
             pass

@@ -32,6 +32,7 @@ NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is v
 MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
 SPARSE = 50.0  # steps between two samples above which the log's time seems to be in another unit
 MOSTLY, WHOLE = (0.01, 0.99), 1.02  # the values of a wrapped angle are so nearly within a turn
+DISORDERED = 0.01  # least share of stamps out of order that counts: sorting mends them
 REGULAR = 10  # an input with more samples is sent continuously; it ends the trial with its last
 
 
@@ -54,9 +55,7 @@ class Samples:
     t: Ints  # (N,) [ns]
     y: Floats  # (N,) scaled and unwrapped
     not_finite: int
-    repeated: int
-    out_of_order: int
-    unstamped: int  # stamp 0, although other stamps are not
+    stamps: int  # those repeated, or 0 although others are not; out of order if many are
     lost: Ints  # (K,) [ns] stamps of samples that are not finite numbers
 
     @cached_property
@@ -271,6 +270,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
         k = int(np.argmin(back))
         by = float(-back[k]) * 1e-9
         raise GroundedError(found("file.clocks", name, by=by, sample=str(k)))
+    late, many = int((back < 0).sum()), DISORDERED * len(series.t)
     order = np.argsort(t, kind="stable")
     t, y = t[order], y[order]
     last_of_stamp = np.append(np.diff(t) != 0, True)
@@ -283,9 +283,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
         t=t - round(spec.delay_s * 1e9),
         y=y,
         not_finite=int((~finite).sum()),
-        repeated=int((~last_of_stamp).sum()),
-        out_of_order=int((back < 0).sum()),
-        unstamped=int((~stamped).sum()),
+        stamps=int((~last_of_stamp).sum()) + int((~stamped).sum()) + late * (late >= many),
         lost=np.sort(series.t[stamped & ~finite]) - round(spec.delay_s * 1e9),
     )
 

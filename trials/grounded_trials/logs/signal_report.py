@@ -26,7 +26,6 @@ LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two
 COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
 FAR_OUTSIDE = 10.0  # times the range of all other samples of a signal: a sample is far outside them
 LOST = 0.1  # least share of a log that is told if one state lacks it
-DISORDERED = 0.01  # least share of stamps out of order that is told; sorting loses nothing of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,9 +44,7 @@ class SignalReport(Document):
     bridged: int  # values of the trial that were interpolated over a gap
     skew_s: float | None  # median of stamp minus log time; None: it is on the log's clock
     not_finite: int  # dropped: NaN or infinite
-    repeated: int  # dropped: same stamp as the next
-    out_of_order: int
-    unstamped: int  # dropped: stamp 0
+    stamps: int  # same as the next, 0, or out of order; see `Samples`
     low: float  # smallest value in the trial, scaled
     high: float  # largest value in the trial, scaled
 
@@ -77,9 +74,7 @@ def report_of(
         bridged=_bridged(samples, at),
         skew_s=series.skew_s,
         not_finite=samples.not_finite,
-        repeated=samples.repeated,
-        out_of_order=samples.out_of_order,
-        unstamped=samples.unstamped,
+        stamps=samples.stamps,
         low=float(values.min()),
         high=float(values.max()),
     )
@@ -195,13 +190,12 @@ def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]
     odd = [found("file.vanished", late=late)] if late > 0 else []
     alike: dict[tuple[tuple[str, Any], ...], list[str]] = {}
     for r in reports:
-        disordered = r.out_of_order if r.out_of_order >= DISORDERED * r.samples else 0
         facts: dict[str, Any] = {
             "lost": r.not_finite,
             "bridged": r.bridged,
             "single": int(r.samples == 1),
+            "stamps": r.stamps,
         }
-        facts |= {"stamps": disordered + r.repeated + r.unstamped}
         if any(facts.values()):
             gap = Quantity(r.largest_gap_s, "s")
             facts |= {"gap": gap, "samples": r.samples}

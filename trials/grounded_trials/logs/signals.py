@@ -154,7 +154,7 @@ class _Log:
         if unknown:
             then = NextCommand("recover", (self.name,))
             raise GroundedError(
-                found("file.damaged", self.name, where=f"channel {unknown[0]}", then=then)
+                found("file.damaged", self.name, part=f"channel {unknown[0]}", then=then)
             )
         for identity, (decoder, wanting) in self.wanted.items():
             if identity in present:

@@ -33,7 +33,6 @@ from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.log_files import column_units, kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
-from grounded_trials.plain_file import unreadable
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.interval import interval_of
@@ -296,7 +295,7 @@ def _usable(
         raise refused("start.no_start", log, why="own")
     report = inspect_log(log, layout)
     if report.damage:
-        raise unreadable(log, report.damage, then=NextCommand("recover", (str(log),)))
+        raise GroundedError(report.damage)
     numbers = [field for field in report.numbers if field.low is not None]
     if not numbers:
         there = [field.path for field in report.numbers]

@@ -76,7 +76,7 @@ class Inspected(Result):
             "topics": [vars(t) | {"fields": [vars(f) for f in t.fields]} for t in report.topics],
             "remarks": [*report.remarks, *self.odd],
             "findings": [one.to_json() for one in report.findings],
-            "damage": report.damage,
+            "damage": report.damage.sentence if report.damage else "",
             "log_table": self.log_table,
         }
 

@@ -230,8 +230,8 @@ class _Table:
         for role in self.roles:
             own = of_joint(role.name, role.unit, self.joints, self.log, sent=role.sent)
             self._joint(role.name, own)
-            fits = own or self.points[self.row[role.name]].max(initial=0.0) >= POINTS_TO_PROPOSE
-            bare[role.name] = "" if fits else role.unit
+            if not own and self.points[self.row[role.name]].max(initial=0.0) < POINTS_TO_PROPOSE:
+                bare[role.name] = role.unit, role.sent
         for name, own in in_order(bare, self.joints, self.log).items():
             self._joint(name, own)
 

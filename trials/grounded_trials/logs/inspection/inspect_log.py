@@ -106,7 +106,7 @@ class LogReport:
     messages: int
     topics: tuple[TopicReport, ...]
     opposite: tuple[Finding, ...]  # signals of different topics with one motion, but for its sign
-    damage: str = ""  # where reading it ended early, and why
+    damage: Finding | None = None  # where reading it ended early, and why
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
     joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names that topics give
     layout: Layout = AS_IT_SAYS  # what was said of its table
@@ -147,7 +147,7 @@ class LogReport:
     @property
     def remarks(self) -> tuple[str, ...]:
         """Its damage and the findings as sentences."""
-        return (*[self.damage] * bool(self.damage), *(one.sentence for one in self.findings))
+        return tuple(one.sentence for one in (self.damage, *self.findings) if one)
 
 
 def _findings(log: LogReport) -> tuple[Finding, ...]:
@@ -196,7 +196,7 @@ def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
         except DamagedFile as error:
             if not look.headers:
                 raise
-            look.damage = str(error)
+            look.damage = error.finding
             break
     return look.report(files)
 
@@ -207,7 +207,7 @@ class _Look:
     def __init__(self) -> None:
         self.headers: list[Header] = []
         self.topics: dict[str, _Topic] = {}
-        self.damage = ""
+        self.damage: Finding | None = None
         self.meta: dict[str, str] = {}
         self.new_file()
 

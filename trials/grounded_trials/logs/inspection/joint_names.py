@@ -33,12 +33,8 @@ TURNS = {  # words of revolute joints, which take precedence: a shoulder's lift,
     *("yaw", "pan", "pitch", "flex", "roll", "tilt", "wheel", "hinge", "revolute", "rotation"),
     *("pole", "pendulum", "swing", "sway", "angle", "theta"),
 } - {"base", "torso"}
-NAMED, ORDERED, UNKNOWN, LESS = (
-    6.0,
-    2.5,
-    1.5,
-    0.2,
-)  # points of a joint's number; less of each further one
+# Points of a joint's number; less of each further one.
+NAMED, ORDERED, UNKNOWN, LESS = 6.0, 2.5, 1.5, 0.2
 
 
 def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
@@ -86,14 +82,11 @@ def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
     Args:
         joints: see `joint_names`.
     """
-    none = dict.fromkeys(TURNING, "")
     return {
-        number_of(topic, kind, i): unit
+        number_of(topic, kind, i): unit * (slides(joint) or bool(_words(joint) & TURNS))
         for topic, names in joints.items()
         for i, joint in enumerate(names)
-        for kind, unit in (
-            SLIDING if slides(joint) else TURNING if _words(joint) & TURNS else none
-        ).items()
+        for kind, unit in (SLIDING if slides(joint) else TURNING).items()
     }
 
 
@@ -141,81 +134,81 @@ def of_joint(
         unit: of it, which decides between position, velocity and effort.
         joints: see `joint_names`.
         log: an inspected log.
-        sent: whether it is an input. An array with a command for each joint is then preferred to
-            measured efforts, which include the delay and the limits of the drive; measured
-            positions and velocities are no commands.
+        sent: whether it is an input.
     """
-    there = _there(log)
     for topic, names in joints.items():
-        for i, joint in ((i, joint) for i, joint in enumerate(names) if holds(name, joint)):
-            measured = SLIDING if slides(joint) else TURNING
-            kind = next((k for k, u in measured.items() if u == unit), None)
-            kind = kind or ("position" if unit in ("m", "1") else None)
-            if kind is None:
-                continue
-            path, why = number_of(topic, kind, i), found("start.joint", topic, joint=joint)
-            if sent and _part(topic) in AIMED:
-                if aimed := _aimed_at(topic, kind, i, there):
-                    return {aimed: Joint(NAMED, why, doubted=False)}
-                continue
+        for joint in (joint for joint in names if holds(name, joint)):
+            kind = {u: k for k, u in (SLIDING if slides(joint) else TURNING).items()}.get(unit)
+            kind = kind or ("position" if unit in ("m", "1") else "")
+            why = found("start.joint", topic, joint=joint)
+            measured = Joint(NAMED, why, doubted=False)
             plain = unit == "1"  # commands may be torques, positions or speeds
-            torque = sent and kind == "effort"
-            if commanded := commands(log, len(names), plain) if torque or (sent and plain) else []:
-                own = [path] if torque and path in there else []
-                return _commanded(commanded, own, from_base(names).index(joint), joint, names)
-            measures = kind != "effort" and not COMMAND_TOPIC.search(topic.lower())
-            if path in there and not (sent and measures):
-                return {path: Joint(NAMED, why, doubted=False)}
+            if kind and (some := _numbers(topic, names, joint, kind, measured, log, sent, plain)):
+                return some
     return {}
 
 
 def in_order(
-    roles: Mapping[str, str],
-    joints: Mapping[str, tuple[str, ...]],
-    log: LogReport,
+    roles: Mapping[str, tuple[str, bool]], joints: Mapping[str, tuple[str, ...]], log: LogReport
 ) -> dict[str, dict[str, Joint]]:
     """Return the numbers of each state and input in order from the base, if none has a name.
 
     There must be as many of a unit as joints. Prismatic joints have states in m, revolute in rad.
 
     Args:
-        roles: the unit of each state and input without a matching name, "" for those with one.
+        roles: the unit of each state and input without a matching name, and whether it is sent.
         joints: see `joint_names`.
         log: an inspected log.
     """
     if len(joints) != 1:
         return {}
     topic, names = next(iter(joints.items()))
-    order, there = from_base(names), _there(log)
     given: dict[str, dict[str, Joint]] = {}
-    kinds = ((k, u, slide) for slide in (False, True) for k, u in (TURNING, SLIDING)[slide].items())
-    for kind, unit, slide in kinds:
-        some = [joint for joint in order if slides(joint) is slide]
-        those = [name for name, own in roles.items() if own == unit]
-        if len(those) != len(some):
-            continue
-        commanded = commands(log, len(names)) if kind == "effort" else []
-        for name, joint in zip(those, some, strict=True):
-            path = number_of(topic, kind, names.index(joint))
-            at, own = order.index(joint), [path] * (path in there)
-            if commanded:
-                given[name] = _commanded(commanded, own, at, joint, names)
-            elif own:
-                why = found("start.joint", topic, joint=joint, index=str(at))
-                known = slide or bool(_words(joint) & TURNS)
-                points = ORDERED if known else UNKNOWN
-                given[name] = {path: Joint(points, why, doubted=len(some) > 1)}
+    for slide, kinds in ((False, TURNING), (True, SLIDING)):
+        some = [joint for joint in from_base(names) if slides(joint) is slide]
+        for kind, unit in kinds.items():
+            those = [name for name, (own, _) in roles.items() if own == unit]
+            for name, joint in zip(those, some, strict=True) if len(those) == len(some) else ():
+                why = found("start.joint", topic, joint=joint, index=str(_place(joint, names)))
+                points = ORDERED if slide or _words(joint) & TURNS else UNKNOWN
+                measured = Joint(points, why, doubted=len(some) > 1)
+                given[name] = _numbers(topic, names, joint, kind, measured, log, roles[name][1])
     return given
 
 
-def _commanded(
-    arrays: Sequence[str], own: Sequence[str], at: int, joint: str, names: Sequence[str]
+def _place(joint: str, names: Sequence[str]) -> int:
+    return from_base(names).index(joint)
+
+
+def _numbers(
+    topic: str,
+    names: Sequence[str],
+    joint: str,
+    kind: str,
+    measured: Joint,
+    log: LogReport,
+    sent: bool,
+    plain: bool = False,
 ) -> dict[str, Joint]:
-    """Return the commands for a joint: by its place in arrays, its effort, the rest of them."""
-    why = found("start.joint", arrays[0], joint=joint, index=str(at))
-    paths = [*(f"{array}[{at}]" for array in arrays), *own]
-    paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
-    return {path: Joint(NAMED - LESS * k, why) for k, path in enumerate(paths)}
+    """Return what is commanded of a joint, or what it does.
+
+    An array with a command for each joint is preferred to measured efforts, which include the
+    delay and the limits of the drive; measured positions and velocities are no commands. Of
+    several arrays, a joint has the number at its place from the base; the others rival with it.
+    """
+    there, path = _there(log), number_of(topic, kind, names.index(joint))
+    torque = sent and kind == "effort"
+    if sent and _part(topic) in AIMED:
+        path = _aimed_at(topic, kind, names.index(joint), there)
+    elif arrays := commands(log, len(names), plain) if torque or (sent and plain) else []:
+        at = _place(joint, names)
+        paths = [f"{array}[{at}]" for array in arrays] + [path] * (torque and path in there)
+        paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
+        why = found("start.joint", arrays[0], joint=joint, index=str(at))
+        return {path: Joint(NAMED - LESS * k, why) for k, path in enumerate(paths)}
+    elif sent and kind != "effort" and not COMMAND_TOPIC.search(topic.lower()):
+        return {}
+    return {path: measured} if path in there else {}
 
 
 def _there(log: LogReport) -> set[str]:
