@@ -22,6 +22,7 @@ from grounded.accounts.motion import (
     HINT,
     LIKE,
     MARGIN,
+    SHORTLIST,
     Ahead,
     Fit,
     horizon_of,
@@ -39,7 +40,6 @@ BETTER = 3.0  # factor by which its share must fall to be mended
 OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
 TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
-SHORTLIST = 8  # accounts for which the model is calibrated
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
 GROSS = 20.0  # a gross factor; of a trial that is as much larger than others: it is examined
 

@@ -32,6 +32,7 @@ SMALLEST_ERROR, TINY = 1e-3, 1e-12
 ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
 MARGIN = 0.8  # [nats] by which any account must lead the others: the one margin
+SHORTLIST = 8  # accounts of a table that are compared in full
 HINT = MARGIN / 2  # [nats] of plain predictions that are looked at
 HALF_ERROR = 0.5  # share of one error
 LIKE = 4.0  # factor within which an input must act as in the model

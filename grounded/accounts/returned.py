@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from grounded.accounts.motion import MARGIN
+from grounded.accounts.motion import MARGIN, SHORTLIST
 from grounded.accounts.reported import tables
 from grounded.accounts.sent import (
     CLEAR,
@@ -47,10 +47,7 @@ from grounded.result import figure, number, with_unit
 from grounded.task import Task
 from grounded.trial import Trial
 
-ROWS_IN_FULL = 12  # rows that are compared in full
 OTHERS = 20  # number of latest candidates to compare with
-ONE, LARGEST = 0.03, 100.0  # factors nearer to 1 are none; largest fitted factor, or its inverse
-NEARLY_ALL = 0.95  # of the steps that tell two policies apart: one must be nearer in these
 TIMES = {"ms": 1e3, "a clock": np.inf, "no unit: it stays 0": 0.0}  # in place of seconds
 UNSENT, LOST = 5, 0.3  # steps before the first command, and share of all, that are not run
 SHARES = np.arange(1, 49) / 50  # of its last value that a first-order filter keeps
@@ -136,14 +133,12 @@ class Row(NamedTuple):
         run: the trial with its columns as the policy got them.
         stories: that the log is so, or that the robot's program made it so; not scored yet.
         steps: of the run that were before it began.
-        fitted: a number of it is fitted to the trial.
     """
 
     policy: Policy
     run: Trial
     stories: tuple[Story, ...]
     steps: int = 0
-    fitted: bool = False
 
 
 def multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
@@ -209,27 +204,14 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     motion, left = apart(own, trial, row.steps), _left(fit)
     for story in row.stories:
         there = motion if story.kind is Kind.PROGRAM else apart(own, row.run, row.steps)
-        known = story.kind is Kind.UNIT and not row.fitted  # a unit that exists, or a sign
         gained = np.log((_left(plain) + FINE) / (left + FINE)) >= story.price + MARGIN
-        if gained and there <= motion and (known or _tells(plain, fit)):
+        if gained and there <= motion:
             yield replace(story, commands=float(np.log(left + FINE)), motion=there)
 
 
 def _left(ran: Following) -> float:
     """Return the rms difference of the commands from the policy's, in units of their size."""
     return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
-
-
-def _tells(plain: Following, fit: Following) -> bool:
-    """Return whether a policy is nearer in nearly all commands in which it differs from the plain.
-
-    Many policies hold an input at the same limit: such commands are no evidence for one of them.
-    """
-    size, T = fit.fine / FINE, min(len(plain.off), len(fit.off))
-    with np.errstate(invalid="ignore"):
-        told = np.abs(plain.off[:T] - fit.off[:T]) > EXPLAINED * size
-        nearer = np.abs(fit.off[:T]) < np.abs(plain.off[:T]) / 2
-    return bool(told.any() and nearer[told].mean() >= NEARLY_ALL)
 
 
 def nearest(rows: Sequence[Row]) -> list[Row]:
@@ -248,7 +230,7 @@ def nearest(rows: Sequence[Row]) -> list[Row]:
         left = np.sqrt(np.median(square, axis=1) + 1e-3 * square.mean(axis=1))
         for k, error in zip(some, left, strict=True):
             score[k] = np.log(error + FINE) + min(one.price for one in rows[k].stories)
-    return [rows[k] for k in sorted(score, key=lambda k: score[k])[:ROWS_IN_FULL]]
+    return [rows[k] for k in sorted(score, key=lambda k: score[k])[:SHORTLIST]]
 
 
 # --- the table ------------------------------------------------------------------------------------
@@ -406,7 +388,11 @@ def _fitted(
         (u > policy.low) & (u < policy.high) for u in (run.sent, run.asked)
     )  # at its limits a command tells nothing
     log = [one for row in known for one in row.stories if one.kind is Kind.UNIT]
-    tried = {(one.names, round(float(np.log(abs(one.by))), 2), one.by > 0) for one in log}
+
+    def about(by: float) -> tuple[float, bool]:
+        return round(float(np.log(abs(by))), 1), by > 0
+
+    tried = {(one.names, about(one.by)) for one in log}
     for group in dict.fromkeys((*(one.names for one in log), tuple(logged))):
         some = np.isin(names, group)
         fed = np.einsum("tmn,tn->tm", gains, some[:n] * trial.states[:T])
@@ -414,12 +400,10 @@ def _fitted(
         where = asked if some[n:].any() else inside
         size = float((slope[where] ** 2).sum())
         by = 1 - float((slope[where] * off[where]).sum()) / size if size else np.nan
-        if not 1 / LARGEST < abs(by) < LARGEST or abs(by - 1) < ONE:
-            continue
-        by = -1.0 if abs(by + 1) < ONE else float(f"{by:.3g}")
-        if (group, round(float(np.log(abs(by))), 2), by > 0) not in tried:
+        by = float(f"{by:.3g}")
+        if by and np.isfinite(by) and about(by) != about(1.0) and (group, about(by)) not in tried:
             story = Story(Kind.UNIT, price=MARGIN, names=group, by=by)
-            yield Row(policy, multiplied(trial, group, by), (story,), fitted=True)
+            yield Row(policy, multiplied(trial, group, by), (story,))
     inside &= asked
     rest, design = off[inside], gains[inside]
     if inside.any(axis=1).sum() < STEPS_TO_JUDGE:

@@ -33,9 +33,9 @@ DIGITS, EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-5, 1e-3, 0.02, 0.05, 0.1
 LATEST = 3  # steps by which commands may be sent or logged late
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
-# differences from the prediction, of a state's usual size: alike; at most in any state of a run as
-# planned (a sign or a unit puts a column farther off); usual in a run like it (1.4 if unrelated)
-NEAR, CLOSE, ALIKE = 0.3, 0.6, 1.0
+# differences from the prediction, of a state's usual size: at most in any state of a run as planned
+# (a sign or a unit puts a column farther off); usual in a run like it (1.4 if unrelated)
+CLOSE, ALIKE = 0.6, 1.0
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 
 
@@ -264,7 +264,7 @@ def far(own: Ran, trial: Trial, first: int = 0) -> Array:
 
 def apart(own: Ran, trial: Trial, first: int = 0) -> float:
     """Return how far a trial, from step `first` on, is from its prediction [nats] in all states."""
-    return float(np.nansum(np.log(np.fmax(far(own, trial, first), NEAR))))
+    return float(np.nansum(np.log(np.fmax(far(own, trial, first), FINE))))
 
 
 def like_predicted(own: Ran, trial: Trial) -> bool:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import Finding
+from grounded.accounts.motion import FEWEST_SAMPLES
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -18,7 +19,6 @@ from grounded.trial import Trial
 
 STUCK = 8  # equal samples before a jump
 HELD = 0.8  # share of runs longer than one sample, above which the sensor is slower than the log
-FEWEST = 20  # changes from sample to sample that are needed
 FULL_TURNS = (2 * np.pi, 360.0)
 ROUNDED = 0.01  # of the largest command: an excess below this is rounding
 
@@ -112,7 +112,7 @@ def _wrapped(s: Signal) -> Found | None:
 
 def _dropouts(s: Signal) -> Found | None:
     """Find a fixed value that the signal jumps to for single samples."""
-    if s.changes.size < FEWEST:
+    if s.changes.size < FEWEST_SAMPLES:
         return None
     far, values = 10 * float(np.quantile(s.changes, 0.9)), []
     for x in s.columns:
@@ -137,7 +137,7 @@ def _held(s: Signal) -> Found | None:
         start, length = runs(x)
         lengths += list(length[np.isfinite(np.diff(x[start], append=np.nan))])
         gone.append(np.isfinite(x) & ~np.isin(np.arange(len(x)), start))
-    if len(lengths) < FEWEST or not s.changes.size:
+    if len(lengths) < FEWEST_SAMPLES or not s.changes.size:
         return None
     coarse = np.quantile(s.changes, 0.5) < 2.5 * s.changes.min()  # coarse quantisation
     if coarse or np.mean(np.array(lengths) >= 2) < HELD:
@@ -148,7 +148,7 @@ def _held(s: Signal) -> Found | None:
 
 def _stuck(s: Signal) -> Found | None:
     """Find a value that stays exactly constant and then jumps to the true one."""
-    if s.changes.size < FEWEST:
+    if s.changes.size < FEWEST_SAMPLES:
         return None
     far, gone, longest = 2 * float(np.median(s.changes)), [], 0
     for x in s.columns:
