@@ -31,7 +31,7 @@ the standard error. So no more is asked of predictions, and more of the evidence
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -227,10 +227,6 @@ class Comparison:
             over_trials(each, count > 0),
             over_trials(each[-1:], count[-1:] > 0),
         )
-
-    def of_channel(self, i: int) -> Comparison:
-        """Return the comparison of the errors of one shown state."""
-        return replace(self, shown=[self.shown[i]], matters=self.matters[:, [i]])
 
     def _by_unit(self, values: Array) -> Array:
         """Return sums over pieces by unit, (K, U, n') of (K, P, n)."""
