@@ -52,28 +52,15 @@ def follow(value: Any, path: MessagePath) -> list[float]:
 
 
 def apply(value: Any, path: MessagePath) -> float:
-    for function in path.functions:
-        if function.name in ("roll", "pitch", "yaw"):
-            x, y, z, w = (field(value, part) for part in "xyzw")
-            norm = math.sqrt(x * x + y * y + z * z + w * w)
-            x, y, z, w = x / norm, y / norm, z / norm, w / norm
-            value = {
-                "roll": lambda x=x, y=y, z=z, w=w: math.atan2(
-                    2 * (w * x + y * z), 1 - 2 * (x * x + y * y)
-                ),
-                "pitch": lambda x=x, y=y, z=z, w=w: math.asin(
-                    max(-1.0, min(1.0, 2 * (w * y - z * x)))
-                ),
-                "yaw": lambda x=x, y=y, z=z, w=w: math.atan2(
-                    2 * (w * z + x * y), 1 - 2 * (y * y + z * z)
-                ),
-            }[function.name]()
-        elif function.name == "norm":
-            value = math.sqrt(sum(v * v for v in value))
-        elif function.name == "mul":
-            value = value * function.argument
-        elif function.name == "add":
-            value = value + function.argument
-        else:
-            raise NotImplementedError(function.name)
-    return float(value)
+    if path.function == "norm":
+        return math.sqrt(sum(v * v for v in value))
+    if not path.function:
+        return float(value)
+    x, y, z, w = (field(value, part) for part in "xyzw")
+    norm = math.sqrt(x * x + y * y + z * z + w * w)
+    x, y, z, w = x / norm, y / norm, z / norm, w / norm
+    return {
+        "rpy.roll": math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)),
+        "rpy.pitch": math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x)))),
+        "rpy.yaw": math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)),
+    }[path.function]

@@ -1,39 +1,33 @@
 """Parse message paths in Foxglove's syntax, which select a number in a topic's messages.
 
-    /odom.pose.pose.orientation.@rpy.yaw      a field, then a function of it
+    /odom.pose.pose.orientation.@rpy.yaw      a field, and a function of it at the end
     /motors.current[2]   .ranges[-1]          an item; negative counts from the end
     /tf.transforms[:]{child_frame_id=="car"}.transform.translation.x
                                               a slice (both ends included), a filter on its items
     "/odd topic.name".data                    names with dots or blanks in quotes
 
 Functions: @rpy.roll|pitch|yaw of a quaternion (named x, y, z, w, or an array w, x, y, z as PX4's),
-@world_velocity.x|y|z of an Odometry message, @norm of a vector or list, and of a number: @abs
-@negative @sign @sqrt @sin @cos @tan @asin @acos @atan @exp @log @ceil @floor @round @deg2rad
-@rad2deg @add(c) @sub(c) @mul(c) @div(c). Filters compare with == != < <= > >=; several may follow
-each other or be joined by &&. This module only parses; `path_walk` applies a path to messages.
+@world_velocity.x|y|z of an Odometry message, @norm of a vector or list. Filters compare with ==
+!= < <= > >=; several may follow each other or be joined by &&. This module only parses;
+`path_walk` applies a path to messages.
 """
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import NoReturn
 
-from grounded.errors import GroundedError, alike
+from grounded.errors import GroundedError
 from grounded.findings import found
 
-_TRIGONOMETRY = ("sin", "cos", "tan", "asin", "acos", "atan")
-_ROUNDING = ("abs", "negative", "sign", "ceil", "floor", "round")
-UNARY = (*_TRIGONOMETRY, *_ROUNDING, "sqrt", "exp", "log", "deg2rad", "rad2deg")
-BINARY = ("add", "sub", "mul", "div")
 ANGLES = ("roll", "pitch", "yaw")
 AXES = ("x", "y", "z")
 WORLD = "world_velocity"  # an Odometry's velocity, turned from the robot's axes into its pose's
 LENGTH_LIMIT = 1000  # characters in a path
 
-_PARTS = {"rpy": ANGLES, WORLD: AXES}  # functions that give several numbers, and their names
+FUNCTIONS = ("norm", *(f"rpy.{one}" for one in ANGLES), *(f"{WORLD}.{one}" for one in AXES))
 
 
 @dataclass(frozen=True)
@@ -65,25 +59,17 @@ class Filter:
     value: float | str
 
 
-@dataclass(frozen=True)
-class Function:
-    """A function of the value found; `argument` is used by the arithmetic ones."""
-
-    name: str
-    argument: float = 0.0
-
-
 Step = Field | Slice | Filter
 
 
 @dataclass(frozen=True)
 class MessagePath:
-    """A topic, the steps into its messages, and functions of the value there."""
+    """A topic, the steps into its messages, and one of `FUNCTIONS` of the value there, or ""."""
 
     text: str
     topic: str
     steps: tuple[Step, ...]
-    functions: tuple[Function, ...] = ()
+    function: str = ""
 
 
 _NAME = r"[A-Za-z0-9_\-]+"
@@ -93,7 +79,6 @@ _TOPIC = re.compile(r"[^\s.\[\]{}\"'@=<>!&]+")
 _FIRST = re.compile(rf"{_QUOTED}|{_TOPIC.pattern}")
 _STEP = re.compile(
     rf"""
-    \.@(?P<function>\w+) (?:\((?P<argument>[^()]*)\))? |
     \.(?P<field>{_NAME}|{_QUOTED}) |
     \[(?P<start>-?\d{{1,9}})?(?P<range>:(?P<stop>-?\d{{1,9}})?)?\] |
     \{{(?P<filters>(?:[^{{}}'"]|'[^']*'|"[^"]*")*)\}}
@@ -137,15 +122,14 @@ def _parsed(text: str) -> MessagePath:
         _fail(text, LENGTH_LIMIT, "its end")
     if (first := _FIRST.match(text)) is None:
         _fail(text, 0, "a topic" if text.strip() else "/topic.field")
-    steps, functions, at = list[Step](), list[Function](), first.end()
+    steps, function, at = list[Step](), "", first.end()
     while at < len(text):
-        if (seen := _STEP.match(text, at)) is None or (functions and not seen["function"]):
-            usual = "a function or the end" if functions else "'.field', '[index]', '{filter}'"
-            _fail(text, at, usual if seen else _EXPECTED.get(text[at], usual))
-        elif seen["function"]:
-            function, at = _function(text, at, seen)
-            functions.append(function)
-            continue
+        if text.startswith(".@", at):
+            if (function := text[at + 2 :]) not in FUNCTIONS:
+                _fail(text, at, f"{', '.join(f'@{one}' for one in FUNCTIONS)}, not '@{function}'")
+            break
+        if (seen := _STEP.match(text, at)) is None:
+            _fail(text, at, _EXPECTED.get(text[at], "'.field', '[index]', '{filter}'"))
         elif seen["field"]:
             steps.append(Field(_bare(seen["field"])))
         elif seen["filters"] is not None:
@@ -157,7 +141,7 @@ def _parsed(text: str) -> MessagePath:
             stop = start if seen["range"] is None else int(seen["stop"] or -1)
             steps.append(Slice(start, stop))
         at = seen.end()
-    return MessagePath(text, _bare(first[0]), tuple(steps), tuple(functions))
+    return MessagePath(text, _bare(first[0]), tuple(steps), function)
 
 
 def _bare(name: str) -> str:
@@ -177,27 +161,6 @@ def _filters(text: str, at: int, inside: str) -> list[Filter]:
         found.append(Filter(tuple(seen["path"].split(".")), seen["operator"], said))
         pos, goes_on = seen.end(), seen[0].endswith("&&")
     return found
-
-
-def _function(text: str, at: int, seen: re.Match[str]) -> tuple[Function, int]:
-    """Return a function, and where the path goes on."""
-    name, given, end = seen["function"], seen["argument"], seen.end()
-    if name in _PARTS and given is None and (part := re.compile(r"\.(\w+)").match(text, end)):
-        if part[1] not in _PARTS[name]:
-            _fail(text, end, f"{' or '.join(_PARTS[name])}, not '{part[1]}'")
-        return Function(part[1]), part.end()
-    if name in _PARTS:
-        wanted = " or ".join(f"@{name}.{one}" for one in _PARTS[name])
-        _fail(text, at, f"{wanted}, not '@{name}'")
-    if name in BINARY:
-        value = float(given) if given and re.fullmatch(_NUMBER, given) else math.nan
-        if not math.isfinite(value) or (name == "div" and value == 0):
-            _fail(text, end, f"@{name}(2): a finite number" + ", not 0" * (name == "div"))
-        return Function(name, value), end
-    if given is not None or name not in ("norm", *UNARY):
-        close = alike(name, ["norm", *_PARTS, *UNARY, *BINARY]) or "norm"
-        _fail(text, at, f"@{close}, not '@{name}'")
-    return Function(name), end
 
 
 def _fail(text: str, at: int, expected: str) -> NoReturn:

@@ -22,12 +22,9 @@ from grounded_trials.formats.bad import BadMessage, BadPath
 from grounded_trials.formats.message_path import (
     ANGLES,
     AXES,
-    BINARY,
-    UNARY,
     WORLD,
     Field,
     Filter,
-    Function,
     MessagePath,
     Slice,
     Step,
@@ -80,7 +77,7 @@ def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
     at, ends = _walk([*range(len(rows))], holders, path.steps[split:])
     if part.is_table and len(ends) > 1:
         raise BadPath("path", expected="one value", found=str(len(ends)))
-    values = _apply(ends, path.functions, part.is_table)
+    values = _apply(ends, path.function, part.is_table)
     if part.is_table:
         every = np.arange(len(part.log_times))
         return Found(every, values, part.log_times) if ends else Found(every[:0], values, None)
@@ -237,22 +234,16 @@ def _times(messages: Ints, holders: Values, names: Sequence[str]) -> tuple[Any, 
 # The number at the end
 
 
-def _apply(values: Values, functions: Sequence[Function], is_table: bool) -> Floats:
-    """Return the numbers at the end of a path after its functions."""
-    first, rest = (functions[0].name, functions[1:]) if functions else ("", ())
-    if first in ANGLES:
-        numbers = _angle(first, _turn(values))
-    elif first in AXES:
-        numbers = _in_world(values, AXES.index(first))
-    elif first == "norm":
-        numbers = np.array([_norm(value) for value in values], dtype=np.float64).reshape(-1)
-    else:
-        numbers, rest = _numbers(values, is_table), tuple(functions)
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        for function in rest:
-            argument = (function.argument,) if function.name in BINARY else ()
-            numbers = _FUNCTIONS[function.name](numbers, *argument)
-    return numbers
+def _apply(values: Values, function: str, is_table: bool) -> Floats:
+    """Return the numbers at the end of a path, of its function if it has one."""
+    kind = function.rpartition(".")[2]
+    if kind in ANGLES:
+        return _angle(kind, _turn(values))
+    if kind in AXES:
+        return _in_world(values, AXES.index(kind))
+    if kind == "norm":
+        return np.array([_norm(value) for value in values], dtype=np.float64).reshape(-1)
+    return _numbers(values, is_table)
 
 
 def _numbers(values: Values, is_table: bool) -> Floats:
@@ -341,12 +332,6 @@ def _norm(value: Any) -> Any:
     if not parts:
         raise BadPath("path", at="@norm", expected="numbers", found=_kind(value))
     return np.sqrt(sum(np.asarray(one, np.float64) ** 2 for one in parts))
-
-
-_NUMPY = {"asin": "arcsin", "acos": "arccos", "atan": "arctan"}  # names in NumPy
-_FUNCTIONS: dict[str, Callable[..., Floats]] = {
-    name: getattr(np, _NUMPY.get(name, name)) for name in UNARY
-} | {"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide}
 
 
 FIELD_LIMIT = 200  # paths listed per topic

@@ -1,18 +1,14 @@
 """Summarise an unknown log: topics, types, rates, and every number with its range.
 
 The files are read once; for topics with very many messages, ranges come from every k-th message.
-Signals of different topics that show the same motion are compared, such as the pitch of a motion
-capture and of the on-board estimate. If their signs are opposite, their conventions differ, and the
-two must not be mixed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -53,15 +49,8 @@ DECODED = 20_000  # decoded messages of a topic beyond which messages are skippe
 GAP = 10.0  # intervals; longer gaps are reported
 SIMULATED_S = 1.0  # [s] header stamps further from the log's clock are simulation time
 SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
-SAME = 0.95  # correlation above which two signals show the same motion
-FEWEST_SAMPLES = 30  # fewest samples
 REPEATS = 0.1  # share of samples like the one before, from which a sensor may come in steps
 STEP = 1 / 3  # of a sensor's step: its standard deviation, a little more than 1 / sqrt(12)
-KINDS = (
-    *(f"@rpy.{angle}" for angle in ("roll", "pitch", "yaw")),
-    *(f"{place}.{axis}" for place in ("position", "translation") for axis in "xyz"),
-    *(f"{rate}.{axis}" for rate in ("linear", "angular") for axis in "xyz"),
-)
 
 
 @dataclass(frozen=True)
@@ -105,7 +94,6 @@ class LogReport:
     duration_s: float
     messages: int
     topics: tuple[TopicReport, ...]
-    opposite: tuple[Finding, ...]  # signals of different topics with one motion, but for its sign
     damage: Finding | None = None  # where reading it ended early, and why
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
     joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names that topics give
@@ -170,7 +158,7 @@ def _findings(log: LogReport) -> tuple[Finding, ...]:
             odd.append(found("file.odd_values", name, first=FIELD_LIMIT))
         if bad:
             odd.append(found("file.odd_values", bad[0], lost="some"))
-    return *odd, *log.opposite
+    return tuple(odd)
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT_SAYS) -> LogReport:
@@ -246,7 +234,6 @@ class _Look:
             duration_s=(end - start) * 1e-9,
             messages=sum(topic.count for topic in self.topics.values()),
             topics=tuple(topic.report(start) for topic in self.topics.values()),
-            opposite=tuple(opposite_signals(self._samples())),
             damage=self.damage,
             meta=self.meta if len(files) == 1 else {},
             joints={
@@ -255,15 +242,6 @@ class _Look:
                 if len(topic.joints) == 1
             },
         )
-
-    def _samples(self) -> dict[str, tuple[Ints, Floats]]:
-        kept = {}
-        for topic in self.topics.values():
-            for path, r in topic.ranges.items():
-                if r.samples:
-                    t, y = (np.concatenate(part) for part in zip(*r.samples, strict=True))
-                    kept[path] = (t, y)
-        return kept
 
 
 @dataclass
@@ -275,13 +253,10 @@ class _Range:
     high: float = -np.inf
     count: int = 0
     not_finite: int = 0
-    samples: list[tuple[Ints, Floats]] | None = None  # kept if it may have a twin
     noises: list[float] = field(default_factory=list)
     repeated: int = 0
 
-    def add(self, values: Floats, log_times: Ints) -> None:
-        if self.samples is not None:
-            self.samples.append((log_times, values))
+    def add(self, values: Floats) -> None:
         finite = values[np.isfinite(values)]
         self.count += len(values)
         self.not_finite += len(values) - len(finite)
@@ -337,7 +312,7 @@ class _Topic:
                 values = evaluate(part, one.path, stamps=i == 0)
             except BadPath:  # of another kind in another JSON message
                 continue
-            one.add(values.values, part.log_times[values.rows])
+            one.add(values.values)
             if values.stamps is not None and len(values.stamps):
                 self.skews.append(values.stamps - part.log_times[values.rows])
 
@@ -346,8 +321,7 @@ class _Topic:
         for rest in dict.fromkeys(rest for one in part.samples for rest in number_paths(one)):
             with suppress(GroundedError):  # a name that no path can contain
                 path = parse_path(topic + rest)
-                self.ranges[path.text] = one = _Range(path)
-                one.samples = [] if measured_kind(path.text) else None
+                self.ranges[path.text] = _Range(path)
 
     def report(self, start: int) -> TopicReport:
         t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)
@@ -411,39 +385,3 @@ def _noise(values: Floats) -> float:
     from grounded.accounts.signals import quantum
 
     return max(noise, STEP * quantum([values]))
-
-
-def measured_kind(path: str) -> str:
-    """Return what a path measures, such as position.x; "" if its name does not show it."""
-    return next((kind for kind in KINDS if path.endswith("." + kind)), "")
-
-
-def opposite_signals(samples: Mapping[str, tuple[Ints, Floats]]) -> Iterator[Finding]:
-    """Yield the pairs of signals of one kind that show the same motion with opposite signs.
-
-    Args:
-        samples: stamps [ns] and values by message path.
-    """
-    for first, second in combinations(samples, 2):
-        if measured_kind(first) == measured_kind(second) != "":
-            correlation = _correlation(samples[first], samples[second])
-            if correlation <= -SAME:
-                yield found("file.opposite", first, second, correlation=correlation)
-
-
-def _correlation(a: tuple[Ints, Floats], b: tuple[Ints, Floats]) -> float:
-    """Return the correlation of the slower signal with the other one at its stamps."""
-    (ta, ya), (tb, yb) = sorted((_clean(*a), _clean(*b)), key=lambda s: len(s[0]))
-    inside = (ta >= tb[0]) & (ta <= tb[-1]) if len(tb) else np.zeros(len(ta), dtype=np.bool_)
-    if inside.sum() < FEWEST_SAMPLES:
-        return 0.0
-    one, other = ya[inside], np.interp(ta[inside], tb, yb)
-    sizes = one.std(), other.std()
-    return float(np.corrcoef(one, other)[0, 1]) if min(sizes) > 1e-3 * max(sizes) else 0.0
-
-
-def _clean(t: Ints, y: Floats) -> tuple[Floats, Floats]:
-    """Return the finite samples, sorted, in seconds; of equal stamps the first."""
-    finite = np.isfinite(y)
-    seconds, first = np.unique(1e-9 * t[finite], return_index=True)
-    return seconds, y[finite][first]
