@@ -24,7 +24,6 @@ from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.propose import show_extent
 from grounded_trials.wording import percent
 from grounded_trials.workspace.candidates.trust import extent_of
-from grounded_trials.workspace.diagnosing import unwritten_in
 from grounded_trials.workspace.last_diagnosis import left_out
 from grounded_trials.workspace.next_step import BEFORE_TRIALS
 
@@ -54,7 +53,7 @@ def diagnose(
             progress=stage,
         )
     left = () if chosen or first else left_out(workspace)
-    tell([*left, *unwritten_in(workspace)], all_=True)
+    tell(left, all_=True)
     yield found
     assert found.then is not None
     _show(found, workspace.base_model.inputs, details=details)

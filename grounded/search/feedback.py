@@ -96,11 +96,6 @@ def between_limits(tried: Tried, task: Task) -> bool:
     return False
 
 
-def jumps(inputs: Array, range_: Array) -> Array:
-    """Count the steps in which each of the inputs (T, m) changes by over half its range, (m,)."""
-    return np.asarray((np.abs(np.diff(inputs, axis=0)) > 0.5 * range_).sum(axis=0))
-
-
 def _swings(values: Array, size: float) -> int:
     """Count how often a signal reverses and moves by `size` or more."""
     if not (np.abs(values - values[0]) >= size).any():  # as a rule

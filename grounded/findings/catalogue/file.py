@@ -70,10 +70,9 @@ ENTRIES: dict[str, Entry] = {
     ),
     "grid": Entry(
         "refuse",
-        "{about} has [[sample {sample} at {at:.4f} s instead of {expected:.4f} s]][[a sample "
-        "every {every:.4g} s]], dt is {dt:.6g} s",
-        "[[set [task] dt = {each:.6g}, the time in s from one command to the next]][[resample? , "
-        "or resample the rows]][[robot? samples are missing or late: run it again]][[append each "
+        "{about} has sample {sample} at {at:.4f} s instead of {expected:.4f} s, dt is {dt:.6g} s",
+        "[[set [task] dt = {each:.6g}, the time in s from one command to the next, or resample the "
+        "rows]][[robot? samples are missing or late: run it again]][[append each "
         "at {unit} times its stamp: it is in another unit]]",
     ),
     # files and folders

@@ -71,23 +71,6 @@ ENTRIES: dict[str, Entry] = {
     ),
     # an adoption
     "adopted": Entry("note", "adopted: {about}"),
-    "beside": Entry(
-        "warn",
-        "{about} {about:was/were} fitted in place of what else was found or adopted, not with it",
-        "remove one of them from [model] effects, or diagnose again",
-    ),
-    "along": Entry(
-        "note",
-        "{about} came along: the plan allows for late sensors, as the robot's program gets them so",
-        "if only the log is late, `grounded adopt --undo`, set delay_s in [log] and adopt again",
-    ),
-    "readings": Entry(
-        "note",
-        "targets and distances of {about} are in readings of its sensor[[, {bias} too {way}]]"
-        "[[, {by:%} too {way}]][[, {age} old]]",
-        "for true values correct the log ([[offset {offset:+.3g}]][[!offset? scale or delay_s]] in "
-        "[log.state]) and the robot's program, and remove the effect",
-    ),
     # taken home
     "no_place": Entry(
         "warn",

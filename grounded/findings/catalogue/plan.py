@@ -115,12 +115,6 @@ ENTRIES: dict[str, Entry] = {
         "draw a larger or slower target, weigh inputs and their changes less, check model.py, or "
         "widen [limits] if the robot can take more",
     ),
-    "rough": Entry(
-        "note",
-        "[[{input} jumps over half its [limits] from one step to the next, {times} times]][[sensor "
-        "noise moves {input} by {shaken:size} rms through the gains, mostly that of {state}]]",
-        "for a smoother {input} increase [reward] input_change of {input}",
-    ),
     "unguarded": Entry(
         "note",
         "{about} {about:leaves/leave} [safety], and [[unweighed? [reward] has no weight for "
@@ -186,11 +180,6 @@ ENTRIES: dict[str, Entry] = {
         "too long for the model",
         "[[set substeps={substeps} in Model(...)]][[!substeps? make the model less stiff]] in "
         "{file}, and plan or diagnose again",
-    ),
-    "oscillates": Entry(
-        "warn",
-        "the feedback of {swung} made inputs oscillate, and that of {candidate} is as strong",
-        STOP,
     ),
     "coasts_out": Entry(
         "warn",

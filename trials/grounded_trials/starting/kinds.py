@@ -25,7 +25,6 @@ from grounded_trials.logs.inspection.names import COMMAND_TOPIC, NAMES_BY_UNIT, 
 from grounded_trials.logs.inspection.relations import Signals
 from grounded_trials.logs.stated_units import Stated, bare_command, command_unit, unit_in_name
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
-from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
 Units = Mapping[str, str]  # unit of a number by its path
@@ -155,7 +154,7 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
             gains[gain] = f'{1.0 * (s in followers)}, "{unit.get(s, "1")}{per}", -100.0, 100.0'
     return Skeleton(
         "generic",
-        f"Numbers that follow the inputs with a lag: {PLACEHOLDER}",
+        "Numbers that follow the inputs with a lag: replace them by your robot's equations",
         {s: unit.get(s, "1") for s in states},
         {i: unit.get(i, "1") for i in inputs},
         lags | gains,

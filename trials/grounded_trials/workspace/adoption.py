@@ -22,7 +22,6 @@ from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
-from grounded.model import Model
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_as, write_document
@@ -264,7 +263,6 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     keep(workspace, _with_std(std, own, adopted), adoptions=(*earlier, step))
 
     # What differs from the fit in which the values were found.
-    fitted = {*names, *before, *(diagnosis.effects if claimed else ()), *diagnosis.late_sensors}
     left = left_behind(diagnosis) if whole_fit else {}
     left = {name: one for name, one in left.items() if name not in own}
     done = Adopted(
@@ -279,18 +277,11 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         left={name: one.value for name, one in left.items()},
         then=to_plan(workspace),
     )
-    named = [effect for effect in adopted if effect["name"] in asked]
-    told = [*_readings(workspace.base_model, named)]
+    told = []
     called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(before.values())}
     for name, e in left.items():
         was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
         told.append(found("model.not_told", called.get(name, name), kept=was, value=value))
-    told += [found("model.along", *done.along)] if done.along else []
-    instead = [] if claimed else asked[:1]
-    beside = [name for name in _names(adopted) if name not in fitted]
-    told += [found("model.beside", *some) for some in (instead, beside) if some]
-    if stopped := [n for n, e in diagnosis.parameters.items() if e.stopped and whole_fit]:
-        told.append(found("model.at_bound", *stopped))
     return replace(done, findings=settle(told))
 
 
@@ -342,21 +333,6 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
         then = NextCommand("adopt", diagnosis.effects or (rivals[0],))
         raise refused("model.not_adoptable", *rivals, why="rival", then=then)
     return not rivals
-
-
-def _readings(model: Model, effects: Effects) -> Iterator[Finding]:
-    """Yield which states are in readings of their sensors, once these effects are adopted."""
-    for effect in effects:
-        family, _, state = str(effect["name"]).partition(":")
-        size = effect.get("b", effect.get("k", 0.0))
-        way = "low" if size < 0 else "high"
-        if family == "sensor_bias":
-            bias = Quantity(abs(size), model.states[state])
-            yield found("model.readings", state, bias=bias, way=way, offset=-size)
-        elif family == "sensor_scale":
-            yield found("model.readings", state, by=abs(size), way=way)
-        elif family == "sensor_delay":
-            yield found("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
 
 
 def undo_adoption(workspace: Folder) -> Undone:

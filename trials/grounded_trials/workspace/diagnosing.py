@@ -46,7 +46,6 @@ from grounded_trials.workspace.next_step import (
     after_diagnosis,
 )
 from grounded_trials.workspace.readings import one_message
-from grounded_trials.workspace.user_files.model_file import PLACEHOLDER
 from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
@@ -205,17 +204,6 @@ def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault
     lifted, together = [planner.lift(trial) for trial in used], one_message(workspace)
     found = sound_trials(planner.plan, lifted, memory, one_message=together)
     return where_to_mend(workspace, used, found.findings)
-
-
-def unwritten_in(workspace: Folder) -> list[Finding]:
-    """Return a note if model.py still has what `init` wrote for a robot of unknown kind."""
-    file = workspace.config.model.file
-    gains = [p.value for name, p in workspace.base_model.params.items() if name.startswith("gain_")]
-    if not file or not gains or any(gains):
-        return []
-    if PLACEHOLDER not in (workspace.folder / file).read_text(encoding="utf-8"):
-        return []
-    return [finding("plan.without_effect", *workspace.base_model.input_names, file=file)]
 
 
 def _probe(

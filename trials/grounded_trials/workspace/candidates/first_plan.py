@@ -2,7 +2,7 @@
 
 Each check is a function of the `Plan`; `CHECKS` lists them in the order in which they are told. A
 task may name no limits, ask for more than they allow, or weigh inputs so much that errors hardly
-count or so little that sensor noise shakes them.
+count.
 """
 
 from __future__ import annotations
@@ -15,8 +15,6 @@ import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.places import samples
-from grounded.search.feedback import jumps
-from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded_trials.workspace.candidates.at_rest import held_before
 from grounded_trials.workspace.folder import Folder
@@ -30,8 +28,6 @@ if TYPE_CHECKING:
 # share of the target's extent above which a plan's error is told: where inputs are at their limits
 # for the share LIMITED of the plan, and at its end
 MISSED, SHORT, LIMITED = 0.05, 0.25, 0.25
-SHAKEN = 0.05  # share of an input's [limits] (else of its range in the plan) moved by noise
-OFTEN = 4  # jumps over half the range of an input; a quick manoeuvre has two or three
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,30 +140,6 @@ def off_target(plan: Plan) -> Iterator[Finding]:
         yield found("plan.falls_short", *at, share=most, what=what, off=missing)
 
 
-def rough(plan: Plan) -> Iterator[Finding]:
-    """Inputs jump over half their [limits], or sensor noise moves them through the gains."""
-    if plan.made is None:
-        return
-    task, gain = plan.task, plan.made.policy.gain
-    span, planned = task.high - task.low, np.ptp(plan.made.predicted_inputs, axis=0)
-    times = jumps(plan.made.predicted_inputs, span)
-    for name, often in zip(task.model.input_names, times.tolist(), strict=True):
-        if often >= OFTEN:
-            yield found("plan.rough", name, input=name, times=often)
-    if gain is None or (times >= OFTEN).any():
-        return
-    noise = sensor_noise(plan.workspace.task_trials(), plan.workspace.base_model.n)
-    by_state = np.mean(gain[:, :, : task.model.n] ** 2 * noise**2, axis=0)  # (m, n)
-    shaken = np.sqrt(by_state.sum(axis=1))
-    allowed = np.where(np.isfinite(span), span, planned)
-    for j, (name, unit) in enumerate(task.model.inputs.items()):
-        if shaken[j] > SHAKEN * allowed[j] > 0:
-            state = task.model.state_names[int(np.argmax(by_state[j]))]
-            yield found(
-                "plan.rough", name, input=name, shaken=Quantity(shaken[j], unit), state=state
-            )
-
-
 def unguarded(plan: Plan) -> Iterator[Finding]:
     """States leave [safety] in a refused plan that have no target, or no weight on it."""
     if plan.refused is None:
@@ -193,7 +165,6 @@ CHECKS: Sequence[Callable[[Plan], Iterator[Finding]]] = (
     without_effect,
     limits_of_log,
     off_target,
-    rough,
     unguarded,
     not_at_rest,
 )

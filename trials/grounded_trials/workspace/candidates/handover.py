@@ -30,7 +30,6 @@ from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.difference import in_question
-from grounded.search.feedback import limit_cycle
 from grounded.search.safety import coasts_out, objections, spread
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -247,26 +246,15 @@ class Check:
         repeats = self.workspace.config.search.repeats
         told = [
             in_question(made, best, repeats) if best is not None and untried else None,
-            *self._oscillates(),
             *self._became(),
         ]
         if not self.same_task:
             told.append(found("plan.other_task", name, weight=Weight.NOTE))
         elif self._changed:
             told.append(found("plan.outdated", name, candidate=name))
-        if self.same_task and not self.standing.trials:
-            told.append(self._too_long())
         if self.same_task:
             told.append(self._coasting())
         yield from (one for one in told if one is not None)
-
-    def _oscillates(self) -> Iterator[Finding]:
-        """Yield that it is, or is made from, one whose feedback made inputs oscillate."""
-        made, task = self.candidate, self.workspace.task
-        for tried in self.standing.history:
-            own, strong = tried.candidate, made.caution <= tried.candidate.caution
-            if own.id in (made.id, made.base) and strong and limit_cycle(tried, task):
-                yield found("plan.oscillates", made.id, candidate=made.id, swung=own.id)
 
     def _became(self) -> Iterator[Finding]:
         """Yield that it lost, that its trials were set aside, or those that it was made from."""
@@ -289,15 +277,6 @@ class Check:
             if one.trial.candidate == name:
                 told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
                 yield told.also(why=aside[one.stored.id])
-
-    def _too_long(self) -> Finding | None:
-        """Return that the integrator's steps are too long for the model, if they are."""
-        from grounded.accounts.time_step import too_long
-
-        made, model = self.candidate, self.workspace.base_model
-        states, inputs = made.predicted_states[:-1], made.predicted_inputs
-        file = self.workspace.config.model.file or self.workspace.config.model.module
-        return too_long(model, states, inputs, made.policy.dt, file)
 
     def _coasting(self) -> Finding | None:
         """Return where the robot goes after the run, with the input held then."""

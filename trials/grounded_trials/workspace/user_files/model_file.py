@@ -25,8 +25,6 @@ from grounded_trials.workspace.user_files.config import FILE
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
-PLACEHOLDER = "replace them by your robot's equations"  # in a model.py that `init` only filled in
-
 
 def load_module(
     folder: Path, file: str = "", module: str = "", key: str = "[model] file"

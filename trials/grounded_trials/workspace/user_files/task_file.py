@@ -241,11 +241,17 @@ def target_arrays(
     t = values[: horizon + 1, 0]
     off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
     if off.max() > 0.01 * dt:
-        _check_interval(path, values[:, 0], dt)
         i = int(np.argmax(off > 0.01 * dt))
-        facts = {"sample": f"of line {i + 2}", "at": t[i], "expected": t[0] + i * dt, "dt": dt}
+        each = float(np.median(np.diff(values[:, 0])))
+        facts = {
+            "each": each,
+            "sample": f"of line {i + 2}",
+            "at": t[i],
+            "expected": t[0] + i * dt,
+            "dt": dt,
+        }
         then = NextCommand("target", (str(path),))
-        raise refused("file.grid", path.name, resample=1, then=then, **facts)
+        raise refused("file.grid", path.name, then=then, **facts)
     target = np.full((horizon + 1, len(states)), np.nan)
     given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
     for i, name in enumerate(states):
@@ -255,21 +261,6 @@ def target_arrays(
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
     return target, np.stack(columns, axis=1)
-
-
-def _check_interval(path: Path, t: Array, dt: float) -> None:
-    """Raise an error that names [task] dt if the rows of a target have another, even interval.
-
-    A dt of at least the whole target is a mistake in dt, not in the target.
-    """
-    lasts = float(t[-1] - t[0])
-    each = lasts / (len(t) - 1)
-    if each <= 0 or np.abs(np.diff(t) - each).max() > 0.01 * each or abs(each - dt) < 0.01 * each:
-        return
-    if dt < lasts:
-        then = NextCommand("target", (str(path),))
-        raise refused("file.grid", path.name, every=each, dt=dt, each=each, resample=1, then=then)
-    raise refused("file.grid", path.name, every=each, dt=dt, each=each)
 
 
 def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
