@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from grounded.policy import Policy
     from grounded.search.ask_tell import Search, TrialRefused, learn
     from grounded.search.improve import propose
-    from grounded.search.step.step_size import SearchOptions
+    from grounded.search.step_size import SearchOptions
     from grounded.task import Task
     from grounded.trial import Trial
     from grounded.utility import Reward
@@ -70,7 +70,7 @@ _HOMES = {
     "grounded.policy": ("Policy",),
     "grounded.search.ask_tell": ("Search", "TrialRefused", "learn"),
     "grounded.search.improve": ("propose",),
-    "grounded.search.step.step_size": ("SearchOptions",),
+    "grounded.search.step_size": ("SearchOptions",),
     "grounded.task": ("Task",),
     "grounded.trial": ("Trial",),
     "grounded.utility": ("Reward",),

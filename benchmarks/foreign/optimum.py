@@ -22,7 +22,7 @@ from grounded.compile import DescentOptions
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.first_policy import first_policy
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve import ddp
 from grounded.task import Task
 from grounded.trial import Trial

@@ -22,7 +22,7 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.trial import Trial
 from grounded_trials.workspace.adopted import planner_of
 

@@ -26,7 +26,7 @@ from grounded.plant import Noise, Plant
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -35,7 +35,7 @@ from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 

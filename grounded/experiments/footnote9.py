@@ -22,7 +22,7 @@ from grounded.experiments.jobs import StudyTable
 from grounded.model import Model, Param
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward

@@ -12,6 +12,7 @@ planner       the model used for planning, with adopted effects
 design        the next trial for a diagnosis: a drive that tells values, a probe of a tie
 safety        checks a candidate before it is handed out
 pictures      figures of the search
-step/         the next step: its size, its direction, and the derivatives behind that
+step_size     damping and alpha of the next step, and the settings of a search
+mispredictions  derivatives corrected from earlier trials; `corrected`: the model with them
 feedback      gains that a real robot bears: oscillation, noise, old samples
 """

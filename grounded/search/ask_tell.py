@@ -32,7 +32,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.improve import propose
 from grounded.search.planner import Planner, planner_with
 from grounded.search.standing import Proposal, Standing
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 

@@ -50,7 +50,7 @@ from grounded.task import Task
 from grounded.trial import Trial, scattered
 
 if TYPE_CHECKING:
-    from grounded.search.step.step_size import SearchOptions
+    from grounded.search.step_size import SearchOptions
 
 PIECES = 4  # parts of a run
 LARGEST_COST_RATIO = 2.0  # largest ratio of costs of candidates whose scatter is pooled

@@ -8,9 +8,9 @@ states at the time of the command. It sees itself further back than it is, and s
 reference. A model that replays the recorded inputs replays that lead; but a policy that is planned
 about the replayed run, and run on such samples again, leads by as much again.
 
-So a policy pi is taken to see x - age dx/dt. The age is that of the incumbent's runs,
+So a policy pi is taken to see x - age dx/dt. The age is the mean over all runs of
 
-    age = argmin sum_t |u_t - pi_t(x_t - age dx_t/dt)|^2
+    argmin sum_t |u_t - pi_t(x_t - age dx_t/dt)|^2
 
 to first order, from the commands and states in its logs. Predicted runs see the states so late
 (`Problem.age`), and the reference of a new policy is late by as much, so that it runs on the robot
@@ -44,7 +44,7 @@ from grounded.frozen import Array, median
 from grounded.policy import Policy, z_difference
 from grounded.rollout import Rollout
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.step.corrected import runs
+from grounded.search.corrected import runs
 from grounded.solve.bias import WINDOW, hann_smoothed
 from grounded.task import Task
 from grounded.trial import Trial
@@ -115,8 +115,6 @@ PROBED = 0.1  # age for the derivative of the commands, in steps
 OLDEST = 2.0  # largest age, in steps; a program that acts on older samples needs another remedy
 # smallest share of the squares of the commands' differences that an age explains
 EXPLAINED_SHARE = 0.25
-# ages differ if by more than both, in s and in steps: less costs little, and noise gives it too
-DIFFERENT_S, DIFFERENT = 3e-3, 0.1
 ROUNDING_OF_COMMANDS = 1e-6  # rms difference of commands, relative to their size, that is rounding
 
 
@@ -160,32 +158,15 @@ def sample_age(task: Task, candidate: Candidate, trials: Sequence[Trial]) -> flo
     return age if clear else 0.0
 
 
-def planned_age(task: Task, incumbent: Tried, ages: Sequence[float]) -> float:
-    """Return the age of samples to plan for [s]: that of the incumbent's runs, or of all runs.
-
-    Args:
-        task: the manoeuvre.
-        incumbent: the best candidate, with its trials.
-        ages: those of all runs [s], see `run_ages`.
-    """
-    if ages and different(task, min(ages), max(ages)):
-        return float(np.mean(ages))
-    return sample_age(task, incumbent.candidate, incumbent.trials)
-
-
-def run_ages(task: Task, history: Sequence[Tried]) -> list[float]:
-    """Return the age of the samples in each whole run of a policy with feedback [s]."""
-    return [
+def planned_age(task: Task, history: Sequence[Tried]) -> float:
+    """Return the age of samples to plan for [s]: the mean of the whole runs with feedback, or 0."""
+    each = [
         sample_age(task, one.candidate, [trial])
         for one in history
         for trial in one.trials
         if one.candidate.policy.gain is not None and trial.finite_steps >= task.horizon
     ]
-
-
-def different(task: Task, age: float, other: float) -> bool:
-    """Return whether two ages [s] differ by so much that it matters."""
-    return abs(age - other) > max(DIFFERENT_S, DIFFERENT * task.dt)
+    return float(np.mean(each)) if each else 0.0
 
 
 def rates(task: Task, trial: Trial) -> Array:

@@ -12,8 +12,8 @@ taken along the true states.
 | 1, 2 | optimal policy of the crude model              | `first_policy` (`first_guess`, `ddp`)   |
 | 3    | run it, record the trial                       | the user: `run`, `ingest`               |
 | 4    | add a bias to the ORIGINAL model               | `bias.ground`                           |
-| 5    | direction d from algorithm A in that model     | `step.directions` (`mispredictions`)    |
-| 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step.step_size`       |
+| 5    | direction d from algorithm A in that model     | `making.direction` (`mispredictions`)   |
+| 6    | theta + alpha d, line search on the real system| `Policy.toward`, `step_size`            |
 | 7    | none improves: return the current policy       | `standing`                              |
 
 `propose` is a pure function: the same candidates and trials give the same next candidate, bit for
@@ -47,7 +47,7 @@ from grounded.search.standing import (
     let_down,
     standing,
 )
-from grounded.search.step.step_size import SearchOptions, Step, losers_of
+from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
 

@@ -9,28 +9,28 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
-from grounded.search.feedback import between_limits, limit_cycle, planned_age, run_ages, steadied
+from grounded.search.feedback import between_limits, limit_cycle, planned_age, steadied
 from grounded.search.noise import beyond_noise
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
 from grounded.search.standing import Ending, Proposal, Standing, ended, wild
-from grounded.search.step.directions import base_columns, direction
-from grounded.search.step.step_size import KEPT_PROMISE, SearchOptions, Step, losers_of
+from grounded.search.step_size import KEPT_PROMISE, SearchOptions, Step, losers_of
 from grounded.solve import ddp
-from grounded.solve.bias import ground
+from grounded.solve.bias import Grounding, ground
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
 
 if TYPE_CHECKING:
-    from grounded.search.step.corrected import Corrected
-    from grounded.search.step.mispredictions import Alternative
+    from grounded.search.corrected import Corrected
+    from grounded.search.mispredictions import Alternative
 
+PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # precise enough for a direction
 GENTLER = 1e3  # factor on the input weights for each unit of caution
 GAIN_SHARE, CAUTION_PARTS = 0.5, 12  # of the mean gain to fall below; parts of a unit of caution
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
@@ -76,7 +76,7 @@ class About:
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         self.grounding = ground(plan, own, match_inputs=options.match_inputs)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
-        age = planned_age(planner.task, incumbent, make.ages)
+        age = make.age
         self.real = exact.on(replace(plan.problem(exact=True), age=age))
         self.theta = planner.widened(incumbent.candidate.policy)
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
@@ -85,13 +85,13 @@ class About:
         self.alternatives: tuple[Alternative, ...] = ()
         self._known_costs: dict[Policy, float] = {}  # in the alternatives
         if way == BY_STEP:
-            from grounded.search.step.mispredictions import believed_by_step
+            from grounded.search.mispredictions import believed_by_step
 
             if found := believed_by_step(planner, incumbent, make.now.history, self.real):
                 self.real, self.corrected = found.problem, found.corrected
                 self.missed = found.missed
         elif options.damps and len(make.now.history) > 1 and not self._kept():
-            from grounded.search.step.mispredictions import believed
+            from grounded.search.mispredictions import believed
 
             found = believed(planner, incumbent, make.now.history, self.real)
             self.alternatives = found.alternatives
@@ -373,9 +373,9 @@ class Maker:
         return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
 
     @cached_property
-    def ages(self) -> list[float]:
-        """The ages of the samples in the runs so far [s]."""
-        return run_ages(self.planner.task, self.now.history)
+    def age(self) -> float:
+        """The age of the samples to plan for [s]."""
+        return planned_age(self.planner.task, self.now.history)
 
     def checked(self, made: Candidate) -> Proposal:
         """Return a proposal of the candidate, or a refusal if it violates limits or [safety]."""
@@ -385,3 +385,70 @@ class Maker:
         ending = Ending.GAINS if against[0].code == "plan.gain" else Ending.NOT_ALLOWED
         stopped = ended(self.now, ending, against[0])
         return Proposal(stopped, None, is_new=False, findings=against, refused=made)
+
+
+# --- the direction of a step (step 5) ---
+
+
+def direction(
+    task: Task,
+    policy: Policy,
+    grounding: Grounding,
+    options: SearchOptions,
+    damping: float = 1.0,
+    corrected: Corrected | None = None,
+    measured: int | None = None,
+) -> Policy:
+    """Step 5: return theta' such that d = theta' - theta improves the policy in the biased model.
+
+    Args:
+        task: the manoeuvre, with the ORIGINAL model.
+        policy: theta, the policy that ran the trial.
+        grounding: the trial as the biased model replays it (step 4).
+        options: selects algorithm A.
+        damping: lambda of `step_size`, factor on the penalty mu for leaving the trial's inputs.
+        corrected: the model with derivatives corrected by trials; None for the original model.
+        measured: number of leading states that the robot measures; None for all of the task's.
+            Gains on the memory of an adopted effect are replaced by gains on those
+            (`measured_gains`). Gains on the memory of a corrected model are dropped
+            (`feedback.margin` checks the effect).
+    """
+    if options.method == "policy-gradient":
+        from grounded.solve.policy_gradient import ascent
+
+        return ascent(task, policy, grounding)
+    problem = grounding.on(task.problem())
+    if options.step == "damped":
+        problem = damped(problem, grounding.inputs, damping)
+    z = grounding.z
+    if corrected is not None:
+        problem, z = corrected.on(problem), corrected.along(z)
+    gains = ddp.sweep(problem, z, grounding.inputs).gains
+    found = ddp.solve(problem, grounding.inputs, gains.K, z[:-1], PLANNING)
+    K = found.K
+    if measured is not None and measured < task.model.n:
+        K = measured_gains(problem, found.z, found.u, K, measured, task.model.states)
+    columns = base_columns(problem, task)
+    return task.policy(found.u, K[:, :, columns], found.z[:-1, columns])
+
+
+def base_columns(problem: Problem, task: Task) -> list[int]:
+    """Return the columns of the problem's z that the task's z has as well."""
+    own = map(problem.system.states.index, task.model.state_names)
+    return [*own, *range(problem.system.n, problem.nz)]
+
+
+def damped(problem: Problem, inputs: Array, factor: float = 1.0) -> Problem:
+    """Add a penalty mu |u_t - inputs_t|^2 on leaving the trial's inputs (H, m) to the problem.
+
+    A fully converged step goes to the optimum of the biased MODEL, which need not improve the real
+    system. The penalty turns the step towards the gradient, which does as long as it is within 90
+    degrees of the true one (section 3). mu is `factor` times R + S, the problem's own weights on
+    inputs and their changes, as in norm-optimal iterative learning control. The two quadratic
+    penalties on u_t combine to the weight R + mu about (R u_target + mu inputs) / (R + mu).
+    """
+    mu = factor * (problem.input_weight + problem.change_weight)
+    weight = problem.input_weight + mu
+    mixed = problem.input_weight * problem.input_target + mu * inputs
+    safe = np.where(weight > 0, weight, 1.0)
+    return replace(problem, input_weight=weight, input_target=mixed / safe)

@@ -32,7 +32,7 @@ from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.difference import LUCK, Difference, Starts, judged, last_gain, missed_by_start
 from grounded.search.pictures import search_figure
-from grounded.search.step.step_size import SearchOptions, Step, losers_of
+from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
 

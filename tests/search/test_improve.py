@@ -21,9 +21,9 @@ from grounded.rollout import simulate
 from grounded.search.ask_tell import Search, learn
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
+from grounded.search.making import damped, direction
 from grounded.search.planner import Planner, model_fingerprint, planner_with
-from grounded.search.step.directions import damped, direction
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import ground
 from shared_data import SUPPORT
 from small_tasks import cart_task, drive, other, plain_task, rover_task

@@ -8,7 +8,7 @@ import pytest
 from grounded.search.candidate import Tried
 from grounded.search.improve import propose
 from grounded.search.safety import MAX_GAIN, coasting, coasts_out, objections, spread
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.trial import Trial
 from small_tasks import cart_task
 

@@ -14,7 +14,7 @@ from grounded.search.ask_tell import learn
 from grounded.search.improve import propose
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import MAX_CAUTION, standing
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.trial import mean_trial
 from grounded.utility import Reward
 from small_tasks import cart_task, drive, other

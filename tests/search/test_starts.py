@@ -10,7 +10,7 @@ from grounded.search.difference import worth_of_start
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
-from grounded.search.step.step_size import SearchOptions, losers_of
+from grounded.search.step_size import SearchOptions, losers_of
 from grounded_trials.workspace.adopted import planner_of
 from small_tasks import cart_task, drive, other
 

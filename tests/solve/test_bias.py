@@ -15,7 +15,7 @@ from grounded.models import aircraft, car, pendulum
 from grounded.plant import Plant
 from grounded.rollout import augmented, simulate
 from grounded.search.improve import propose
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import ground, residuals
 from grounded.trial import Trial
 from small_tasks import black_box, cart_task, drive, other, rover_task

@@ -18,7 +18,7 @@ from grounded.models import aircraft
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.standing import standing
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
 from grounded_trials.report.findings import Findings, Run

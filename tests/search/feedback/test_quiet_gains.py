@@ -8,7 +8,7 @@ from grounded.plant import Noise, Plant
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
 from grounded.search.standing import standing
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from small_tasks import drive, scara, scara_task
 
 OPTIONS = SearchOptions()

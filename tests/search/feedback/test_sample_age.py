@@ -9,7 +9,7 @@ from grounded.policy import z_difference
 from grounded.rollout import for_late_samples, simulate
 from grounded.search.feedback import sample_age
 from grounded.search.improve import propose
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.trial import Trial
 from small_tasks import rover, rover_task
 

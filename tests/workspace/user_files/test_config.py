@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from facts import holding
 from grounded.errors import GroundedError
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded_trials.logs.log_table import log_mapping
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.candidates.running import simulated_plant

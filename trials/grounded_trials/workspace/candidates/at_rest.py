@@ -123,23 +123,17 @@ UNGIVEN = 3  # largest number of states without a start value that are solved fo
 # the robot is at rest if it moves less than this share of the motion as configured
 AT_REST_SHARE = 1e-3
 ZERO_INPUT = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
-MOVED = 0.01  # fraction of the same by which a given input must differ to be reported
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
 STILL = 1e-9  # motion in a step, in a state's unit, that counts as none
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
 
-def held_before(workspace: Folder, again: bool = False) -> Finding | None:
+def held_before(workspace: Folder) -> Finding | None:
     """Return that the robot is not at rest at its start, but would be under another input.
 
     Values of states that the user did not give (a fan's speed, say) may be changed too. Nothing is
     told if the user gave the inputs, or if they make no difference: without weights on changes and
     without latency the first command does not depend on the input held before.
-
-    Args:
-        workspace: the workspace of the first plan.
-        again: whether another model was used for an earlier plan: inputs that the user gave are
-            checked too, since they may have held that one.
     """
     base, planner, config = workspace.task, workspace.planner, workspace.config.task
     task, n, names = planner.plan, base.model.n, planner.plan.model.input_names
@@ -155,7 +149,7 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
     free[[one.j for one in integrals(base.model) if one.exact]] = False  # at rest, a rate is 0
     chosen = any(name in config.start for name in names)
     priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if (chosen and not again) or not priced else resting(task, memory, planner.loose)
+    stands = None if chosen or not priced else resting(task, memory, planner.loose)
     if stands is None and 0 < free[:n].sum() <= UNGIVEN:
         stands = resting(task, free, planner.loose)
     if stands is None:
@@ -169,7 +163,7 @@ def held_before(workspace: Folder, again: bool = False) -> Finding | None:
     span = np.append(np.ones(n), task.high - task.low)
     span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
     stands[np.abs(stands) < ZERO_INPUT * span] = 0.0
-    if not (np.abs(stands - given) > (MOVED if chosen else ZERO_INPUT) * span).any():
+    if not (np.abs(stands - given) > ZERO_INPUT * span).any():
         return None
     rate = moved_at_start(task, task.past)[:n] / task.dt
     k = int(np.argmax(np.abs(rate)))

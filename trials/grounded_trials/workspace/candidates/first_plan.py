@@ -38,13 +38,11 @@ class Plan:
         workspace: a workspace in which nothing was run yet.
         made: the first candidate; None if it was refused.
         refused: the refused one; None if there is a candidate.
-        again: whether another model was used for an earlier plan.
     """
 
     workspace: Folder
     made: Candidate | None
     refused: Candidate | None
-    again: bool = False
 
     @property
     def task(self) -> Task:
@@ -67,7 +65,7 @@ class Plan:
         return shares
 
 
-def left_open(workspace: Folder, proposal: Proposal, again: bool) -> list[Finding]:
+def left_open(workspace: Folder, proposal: Proposal) -> list[Finding]:
     """Return what the operator should know of the configuration before the first run.
 
     If one has a command, that comes first: a second `propose` hands the candidate out.
@@ -75,9 +73,8 @@ def left_open(workspace: Folder, proposal: Proposal, again: bool) -> list[Findin
     Args:
         workspace: a workspace in which nothing was run yet.
         proposal: the first plan, or why there is none.
-        again: whether another model was used for an earlier plan.
     """
-    plan = Plan(workspace, proposal.candidate, proposal.refused, again)
+    plan = Plan(workspace, proposal.candidate, proposal.refused)
     return [one for check in CHECKS for one in check(plan)]
 
 
@@ -156,7 +153,7 @@ def unguarded(plan: Plan) -> Iterator[Finding]:
 
 def not_at_rest(plan: Plan) -> Iterator[Finding]:
     """The robot is not at rest at its start, but would be under another input."""
-    if one := held_before(plan.workspace, plan.again):
+    if one := held_before(plan.workspace):
         yield one
 
 

@@ -26,7 +26,6 @@ from grounded_trials.workspace.candidates.handover import (
     unmapped,
 )
 from grounded_trials.workspace.candidates.search_state import (
-    MODEL,
     answered,
     overtaken,
     planned,
@@ -171,7 +170,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.first_plan import left_open
 
-        first = left_open(workspace, proposal, MODEL in [c.facts.get("why") for c in changed])
+        first = left_open(workspace, proposal)
         notes += first
     asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)

@@ -16,7 +16,7 @@ from grounded.findings import Finding, Quantity, found
 from grounded.findings.finding import Fact
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import missed_by_start
-from grounded.search.step.step_size import Step
+from grounded.search.step_size import Step
 from grounded.task import Task
 from grounded_trials.workspace.off_target import reaches
 

@@ -9,21 +9,21 @@ A body whose mass follows from its geoms gets an `inertial` element.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 
 from grounded.adapters.mujoco_names import FIELDS
+from grounded_trials.plain_file import unreadable
 from grounded_trials.workspace.home.held import Number
-from grounded_trials.workspace.home.xml_text import (
-    Element,
-    XmlText,
-    first_child,
-    set_or_remove,
-)
 
+Element = ElementTree.Element
+# what may stand before the root: declaration, comments, document type
+_PROLOGUE = re.compile(rb"(?:\s+|<\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>]*>)*", re.DOTALL)
 VECTORS = {"gear": "actuator_gear", "friction": "geom_friction"}  # written as a whole if new
 # shortcuts that `general` can replace, and what each says in attributes of its own
 SHORTCUTS = {
@@ -181,7 +181,7 @@ class Mjcf:
             return False
         if element.tag != "general":
             for name in SHORTCUTS[element.tag]:
-                set_or_remove(element, name, None)
+                element.attrib.pop(name, None)
             self._typed(element, i)
             element.tag = "general"
         if number.field == "lag":
@@ -258,3 +258,56 @@ class Urdf:
         if inertia is not None:
             inertia.attrib = {n: f"{float(v) * factor:.10g}" for n, v in inertia.items()}
         return True
+
+
+# an XML file whose comments, order and layout of elements stay
+
+
+class XmlText:
+    """An XML file, with its root."""
+
+    def __init__(self, data: bytes, name: str) -> None:
+        """Parse a file.
+
+        Raises:
+            GroundedError: if it is not XML.
+        """
+        self.data = data
+        kept = ElementTree.TreeBuilder(insert_comments=True, insert_pis=True)
+        try:
+            parser = ElementTree.XMLParser(target=kept)
+            self.root = ElementTree.fromstring(data, parser)
+        except (ElementTree.ParseError, ValueError) as error:
+            raise unreadable(name, f"it is no XML: {error}") from None
+        self._before = self._text()
+
+    @property
+    def changed(self) -> bool:
+        """Whether anything of it was changed."""
+        return self._text() != self._before
+
+    def written(self, comment: str = "") -> bytes:
+        """Return the file with all changes, and with a comment before its root."""
+        found = _PROLOGUE.match(self.data)
+        head = self.data[: found.end()] if found else b""
+        end = self.data.rfind(b"</" + self.root.tag.encode())
+        tail = self.data[self.data.index(b">", end) + 1 :] if end >= 0 else b"\n"
+        new = (comment + self._text()).replace("\n", "\r\n" if b"\r\n" in self.data else "\n")
+        return head + new.encode() + tail
+
+    def _text(self) -> str:
+        return ElementTree.tostring(self.root, encoding="unicode").replace(" />", "/>")
+
+
+def first_child(element: Element, tag: str) -> Element:
+    """Insert an empty element as the first child of another, on a line of its own."""
+    new = ElementTree.Element(tag)
+    new.tail = element.text
+    element.insert(0, new)
+    return new
+
+
+def commented(lines: list[str]) -> str:
+    """Return lines as an XML comment, in which two hyphens must not stand together."""
+    inside = "\n".join(f"  {line}" for line in lines).replace("--", "- -")
+    return f"<!--\n{inside}\n-->\n"

@@ -29,8 +29,7 @@ from grounded_trials.workspace.adopted import installed_effects
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held, Number, value_of
-from grounded_trials.workspace.home.mjcf import Mjcf, Urdf
-from grounded_trials.workspace.home.xml_text import XmlText, commented
+from grounded_trials.workspace.home.mjcf import Mjcf, Urdf, XmlText, commented
 from grounded_trials.workspace.user_files.model_file import load_module
 
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to

@@ -17,7 +17,7 @@ from types import MappingProxyType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from grounded.errors import GroundedError
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table, read_toml
 

@@ -9,11 +9,11 @@ from grounded.model import Model
 from grounded.plant import Plant
 from grounded.search.ask_tell import Search, learn
 from grounded.search.candidate import BY_STEP
+from grounded.search.corrected import Corrected, runs
 from grounded.search.feedback import worse_costs
+from grounded.search.mispredictions import PRICES, Seen, Told, seen
 from grounded.search.planner import Planner, predicted
-from grounded.search.step.corrected import Corrected, runs
-from grounded.search.step.mispredictions import PRICES, Seen, Told, seen
-from grounded.search.step.step_size import SearchOptions
+from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive
 
@@ -106,9 +106,7 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     together = runs([late] * len(tried), tried)
     assert len(steps) - one_by_one < 0.3 * one_by_one
     assert_same_runs(together, alone)
-    monkeypatch.setattr(
-        "grounded.search.step.corrected.MOST_GAINS", 1
-    )  # a long horizon: one at a time
+    monkeypatch.setattr("grounded.search.corrected.MOST_GAINS", 1)  # a long horizon: one at a time
     assert_same_runs(runs([late] * len(tried), tried), alone)
     assert worse_costs([late], replace(policy, gain=None, reference=None)).min() == np.inf
 

@@ -57,8 +57,8 @@ from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
 from grounded.rollout import Run, apart, augmented
 from grounded.search.candidate import Tried
+from grounded.search.corrected import Corrected, runs
 from grounded.search.planner import Planner
-from grounded.search.step.corrected import Corrected, runs
 from grounded.solve.bias import input_span
 from grounded.trial import mean_trial
 

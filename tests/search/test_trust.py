@@ -2,7 +2,7 @@
 
 import pytest
 
-from grounded.search.step.step_size import (
+from grounded.search.step_size import (
     LARGEST_DAMPING,
     SMALLEST_DAMPING,
     Step,

@@ -8,8 +8,8 @@ import pytest
 from grounded.plant import Plant
 from grounded.rollout import simulate
 from grounded.search.ask_tell import Search
+from grounded.search.mispredictions import believed, shared
 from grounded.search.planner import Planner, predicted
-from grounded.search.step.mispredictions import believed, shared
 from grounded.solve.bias import ground
 from small_tasks import cart_task, drive, other, rover_task
 
