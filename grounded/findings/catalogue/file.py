@@ -176,6 +176,10 @@ ENTRIES: dict[str, Entry] = {
         "[[ {stamps:stamp} out of order, repeated or 0]][[ held from a single sample{single:1=}]]"
         "[[, the largest gap is {gap}]]",
     ),
+    "opposite": Entry(
+        "warn",
+        "{about} show the same motion with OPPOSITE SIGN, correlation {correlation:.3f}",
+    ),
     # what is lost
     "cut": Entry(
         "warn",

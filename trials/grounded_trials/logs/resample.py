@@ -158,7 +158,7 @@ def to_grid(
     """
     span = span or Span()
     names = [*states, *inputs]
-    check_clocks({n: series[n] for n in (*names, *span.signals())})
+    clocks = check_clocks({n: series[n] for n in (*names, *span.signals())})
     samples = {n: tidy(n, series[n], unwrap=n in angles) for n in names}
     check_overlap([samples[n] for n in states], [samples[n] for n in inputs])
     how: dict[str, str] = {
@@ -203,7 +203,7 @@ def to_grid(
         odd = outliers(tracked, start, int(grid[-1]))
         cut = stop == until and (steps is None or count < steps) and span.end is None
         gone = vanished([samples[n] for n in states], int(grid[-1] + dt * 1e9)) if cut else []
-        return reports, (*findings_of(reports, late), *stairs, *odd, *gone)
+        return reports, (*findings_of(reports, late), *clocks, *stairs, *odd, *gone)
 
     held, assumed = _sent_before(sent, start, dt, rest if still else None)
     if assumed and rest is not None and in_motion(sent, start, rest):

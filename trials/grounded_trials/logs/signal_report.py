@@ -89,25 +89,20 @@ def _bridged(samples: Samples, at: Ints) -> int:
     return int((wide & (at > t[i - 1]) & (at < t[i])).sum())
 
 
-def check_clocks(series: Mapping[str, Series]) -> None:
-    """Raise an error for signals on different clocks, such as simulation time and log time.
+def check_clocks(series: Mapping[str, Series]) -> list[Finding]:
+    """Return what there is to say of signals whose clocks differ a little.
 
     Raises:
-        GroundedError: naming two of them, and the difference.
+        GroundedError: for signals on different clocks, such as simulation time and log time, naming
+            two of them, and the difference.
     """
-    first, last, apart = _furthest({name: s.skew_s for name, s in series.items()})
+    behind = {name: one.skew_s or 0.0 for name, one in series.items()}  # None: the log's own
+    first, last = min(behind, key=behind.__getitem__), max(behind, key=behind.__getitem__)
+    apart = behind[last] - behind[first]
     if apart > MIXED_S:
         raise GroundedError(found("file.clocks", first, last, apart=apart))
-
-
-def _furthest(skews: Mapping[str, float | None]) -> tuple[str, str, float]:
-    """Return the signals whose clocks are furthest behind and ahead, and the difference [s].
-
-    A skew of None stands for the log's own clock.
-    """
-    known = {name: skew or 0.0 for name, skew in skews.items()}
-    first, last = min(known, key=known.__getitem__), max(known, key=known.__getitem__)
-    return first, last, known[last] - known[first]
+    told = apart > SKEW_S and len({one.spec.clock for one in series.values()}) > 1
+    return [found("file.clocks", first, last, apart=apart, weight=Weight.WARN)] * told
 
 
 def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> list[Finding]:
@@ -200,8 +195,4 @@ def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]
             gap = Quantity(r.largest_gap_s, "s")
             facts |= {"gap": gap, "samples": r.samples}
             alike.setdefault(tuple(facts.items()), []).append(r.name)
-    odd += [found("file.odd_values", *names, **dict(facts)) for facts, names in alike.items()]
-    low, high, apart = _furthest({r.name: r.skew_s for r in reports})
-    if len({r.clock for r in reports}) > 1 and apart > SKEW_S:
-        odd.append(found("file.clocks", low, high, apart=apart, weight=Weight.WARN))
-    return odd
+    return odd + [found("file.odd_values", *n, **dict(facts)) for facts, n in alike.items()]

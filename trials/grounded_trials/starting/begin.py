@@ -21,7 +21,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import heading, rate_states
+from grounded.places import heading
 from grounded.result import NULL, UNSAID, Document
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import about_table
@@ -196,9 +196,7 @@ def begin(
                 ranges[g.name] = min(seen[0], 0.0), max(seen[1], 0.0)
 
         # The files: the target is read from the log as its [log] table says.
-        table = mapping_toml(
-            states, commands, simulated=report.simulated, rates=rate_states(made), layout=layout
-        )
+        table = mapping_toml(states, commands, simulated=report.simulated, layout=layout)
         columns, sent, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
         horizon = len(next(iter(columns.values()))) - 1
         stood = held_first(made, columns, sent, step, ranges) or {}

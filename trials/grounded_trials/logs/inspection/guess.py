@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 from grounded.findings import Finding
 from grounded.result import extent
@@ -41,7 +40,6 @@ class Guess:
 
 
 ALTERNATIVES = 8  # alternatives listed
-LESS = 0.8  # of a value: a rounded one below it has two digits
 DRIFT = 2e-4  # of a signal's range: the smallest standard deviation proposed for it
 
 
@@ -50,7 +48,6 @@ def mapping_toml(
     inputs: Sequence[Guess],
     *,
     simulated: bool = False,
-    rates: Mapping[str, str] = MappingProxyType({}),
     layout: Layout = AS_IT_SAYS,
 ) -> str:
     """Format guesses as a [log] table, with comments where a person should check.
@@ -59,7 +56,6 @@ def mapping_toml(
         states: one guess for each state.
         inputs: one guess for each input.
         simulated: whether header stamps are on another clock than the log.
-        rates: the states whose rate is another state, {q: w}.
         layout: what the log's table does not say.
     """
     clock = "log" if simulated else "header"
@@ -73,64 +69,39 @@ def mapping_toml(
     for kind, guesses in (("state", states), ("input", inputs)):
         for guess in guesses:
             lines += ["", *_table(kind, guess, clock)]
-    lines += _estimate(states, rates)
+    lines += _estimate(states)
     return "\n".join(lines) + "\n"
 
 
 def _table(kind: str, guess: Guess, clock: str) -> list[str]:
+    """Return the lines of a signal; one without a path has its best rival, as a comment."""
     head = f"[log.{kind}.{key(guess.name)}]"
-    others = f"; or {', '.join(guess.others[:ALTERNATIVES])}" if guess.others else ""
-    if not guess.path and not guess.others:
+    path, *rivals = [*filter(None, [guess.path]), *guess.others] or [""]
+    if not path:
         return [f"# {head}  # nothing in the log fits"]
-    if not guess.path:
-        rest = f"  # or {', '.join(guess.others[1:ALTERNATIVES])}" * (len(guess.others) > 1)
-        keys = (_scale(guess), _clock(guess, clock), _unwrap(guess.others[0]))
-        more = [f"# {line}" for line in keys if line]
-        what = f"no name in the log fits; to use one of these, remove all {len(more) + 2} #"
-        what = what if more else what.replace("all 2", "both")
-        return [f"# {head}  # {what}", f"# path = {_quote(guess.others[0])}{rest}", *more]
-    lines = [head if guess.sure else f"{head}  # unsure{others}"]
-    lines.append(f"path = {_quote(guess.path)}")
+    lines = [f"path = {_quote(path)}"]
     field = guess.field
     if field is not None and field.low is not None and field.high is not None:
         low, high = extent(field.low, field.high)
-        lines[-1] += f"  # {low:.4g} to {high:.4g} in this log"
-    if guess.reasons:
-        lines.insert(1, f"# {'; '.join(one.sentence for one in guess.reasons)}")
-    if scale := _scale(guess):
-        lines.append(scale)
-    return lines + [line for line in (_clock(guess, clock), _unwrap(guess.path)) if line]
+        lines[0] += f"  # {low:.4g} to {high:.4g} in this log"
+    lines += [f"scale = {guess.scale:.10g}"] * (guess.scale != 1.0)
+    lines += [f'clock = "{guess.clock}"'] * (guess.clock != clock)
+    lines += ["unwrap = true"] * path.endswith("@rpy.yaw")
+    others = f"; or {', '.join(rivals[:ALTERNATIVES])}" * bool(rivals)
+    if not guess.path:
+        head += f"  # no name in the log fits; to use this, remove the # of each line{others}"
+        return [f"# {line}" for line in (head, *lines)]
+    why = [f"# {'; '.join(one.sentence for one in guess.reasons)}"] * bool(guess.reasons)
+    return [head + f"  # unsure{others}" * (not guess.sure), *why, *lines]
 
 
-def _clock(guess: Guess, usual: str) -> str:
-    return f'clock = "{guess.clock}"' * (guess.clock != usual)
-
-
-def _scale(guess: Guess) -> str:
-    return f"scale = {guess.scale:.10g}" * (guess.scale != 1.0)
-
-
-def _unwrap(path: str) -> str:
-    return "unwrap = true" * path.endswith("@rpy.yaw")
-
-
-def _estimate(states: Sequence[Guess], rates: Mapping[str, str]) -> list[str]:
-    """Return an [estimate] table for the states that the log does not contain.
-
-    It is commented out if no state was found: that is for logs that lack the rates.
-    """
+def _estimate(states: Sequence[Guess]) -> list[str]:
+    """Return an [estimate] table for the states that the log does not contain."""
     missing, known = [guess.name for guess in states if not guess.path], estimating(states)
-    if not known and (later := [q for q in rates if q not in rates.values()]):
-        deviations = ", ".join(f"{name} = 0.01" for name in later)
-        return [
-            "",
-            f"# [estimate]  # if the log lacks {', '.join(rates[q] for q in later)}: remove both #",
-            f"# measured = {{ {deviations} }}  # standard deviations, in the model's units",
-        ]
     if not missing or not known:
         return []
     deviations = ", ".join(
-        f"{guess.name} = {_short(abs(guess.scale) * _deviation(guess))}" for guess in known
+        f"{guess.name} = {abs(guess.scale) * _deviation(guess):.2g}" for guess in known
     )
     return [
         "",
@@ -150,12 +121,6 @@ def _deviation(guess: Guess) -> float:
     assert guess.field is not None
     low, high = guess.field.low or 0.0, guess.field.high or 0.0
     return max(guess.field.noise, DRIFT * (high - low), 1e-6)
-
-
-def _short(value: float) -> str:
-    """Format a value with one digit, or two where one would be much less."""
-    text = f"{value:.1g}"
-    return text if float(text) > LESS * value else f"{value:.2g}"
 
 
 def _quote(path: str) -> str:
