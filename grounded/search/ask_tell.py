@@ -296,14 +296,9 @@ def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
     """Run a candidate and return the trial.
 
     Raises:
-        GroundedError: if the function takes a policy instead of a candidate, or returns no trial.
+        GroundedError: if the function returns no trial.
     """
-    try:
-        trial = run(candidate)
-    except AttributeError as error:
-        if error.obj is not candidate or not hasattr(candidate.policy, error.name or ""):
-            raise
-        raise wrong(f"the object whose '{error.name}' is read", must="policy") from error
+    trial = run(candidate)
     if not isinstance(trial, Trial):
         raise wrong("what run(candidate) returns", got=f"a {type(trial).__name__}", must="trial")
     return trial

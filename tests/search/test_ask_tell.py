@@ -139,10 +139,6 @@ def test_what_a_user_gets_wrong_in_python_is_said():
         ),
         (lambda: gr.Search(replace(TASK, model=two)).ask(), r"\(s, a, p\)"),
         (lambda: gr.learn(TASK, lambda candidate: None), holding("gr.Trial", "NoneType")),
-        (
-            lambda: gr.learn(TASK, lambda policy: policy.horizon),
-            holding("'horizon'", "c.policy"),
-        ),
         (lambda: gr.learn(TASK, lambda candidate: "run.mcap"), holding("gr.Trial", "a str")),
         (lambda: gr.learn(TASK, "drive.py"), holding("run", "function", "a str")),
         (lambda: gr.learn(TASK, run, 5), holding("options", "SearchOptions", "a int")),
@@ -167,13 +163,6 @@ def test_what_a_user_gets_wrong_in_python_is_said():
     ):
         with pytest.raises(gr.GroundedError, match=told):
             mistake()
-
-
-def test_an_attribute_error_of_the_users_own_program_stays_what_it_is():
-    with pytest.raises(AttributeError, match="no attribute 'horizon'"):
-        gr.learn(TASK, lambda candidate: candidate.id.horizon)
-    with pytest.raises(AttributeError, match="no attribute 'colour'"):
-        gr.learn(TASK, lambda candidate: candidate.colour)
 
 
 def test_results_are_one_line_a_table_and_a_document(search):

@@ -28,7 +28,7 @@ WRONG = [  # command, what its message names
     (["discard", "t2"], ["'t0002'"]),
     (["run", "2"], ["'c0002'"]),
     (["ingest", "t0001"], ["t0001"]),
-    (["inspect", "t0001"], ["trials/t0001-"]),
+    (["inspect", "t0001"], ["t0001"]),
     (["target", "c0001"], ["c0001"]),
     (["next", "c0001"], ["c0001"]),
 ]

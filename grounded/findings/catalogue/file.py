@@ -37,7 +37,7 @@ ENTRIES: dict[str, Entry] = {
     "no_log": Entry(
         "refuse",
         "{about} is no log[[ but a {head}]][[: it begins with {begins}]]"
-        "[[, it is a workspace{own:1=}]][[: its own is {path}]]",
+        "[[, it is a workspace{own:1=}]]",
         "[[!tables? give the file that the robot's program wrote: MCAP, ROS 2 .db3, ROS 1 .bag, "
         ".csv, .npz, .parquet, .mat, PX4 .ulg or ArduPilot .bin]][[give {tables} as one .npz if "
         "they are one run: see docs/log-reference.md, two tables with two clocks]]",
@@ -70,7 +70,8 @@ ENTRIES: dict[str, Entry] = {
     ),
     "grid": Entry(
         "refuse",
-        "{about} has sample {sample} at {at:.4f} s instead of {expected:.4f} s, dt is {dt:.6g} s",
+        "{about} has [[sample {sample} at {at:.4f} s instead of {expected:.4f} s]][[a sample "
+        "every {every:.4g} s]], dt is {dt:.6g} s",
         "[[set [task] dt = {each:.6g}, the time in s from one command to the next, or resample the "
         "rows]][[robot? samples are missing or late: run it again]][[append each "
         "at {unit} times its stamp: it is in another unit]]",

@@ -40,7 +40,7 @@ from grounded_trials.workspace.candidates.at_rest import (
 )
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import refuse_ids, unknown_trial
+from grounded_trials.workspace.identity import unknown_trial
 from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven
 from grounded_trials.workspace.user_files.config import set_numbers
@@ -66,7 +66,6 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         stored = {one.id: one.path for one in workspace.store.list()}
         path = stored.get(file.lower(), path)
     if not path.exists():
-        refuse_ids(workspace, file, "target")
         raise unknown("file or shape", file, shapes)
     if path.is_file() and kind_of(path) == TRIAL:
         trial, _, _ = read_trial(path)

@@ -354,20 +354,3 @@ def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str])
         if name.lower() not in usable:
             raise unknown_trial(workspace, name)
     return tuple(name.lower() for name in given)
-
-
-def refuse_ids(workspace: Folder, log: str | Path, verb: str) -> None:
-    """Raise an error if a trial or candidate was named in place of the file of a log.
-
-    Args:
-        workspace: the workspace.
-        log: what was given; a file or folder of that name is accepted.
-        verb: the command, such as "inspect".
-    """
-    given = str(log).lower()
-    if not _SHORT.fullmatch(given) or Path(log).exists():
-        return
-    paths = {one.id: str(one.path) for one in workspace.store.list()}
-    if given in paths or given in workspace.candidate_ids():
-        path = None if verb == "ingest" else paths.get(given)
-        raise refused("file.no_log", str(log), path=path)

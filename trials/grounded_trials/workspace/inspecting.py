@@ -17,7 +17,6 @@ from grounded_trials.logs.log_table import layout_of
 from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import refuse_ids
 from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.user_files.config import FILE
 
@@ -94,7 +93,6 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
         GroundedError: if the log can't be read at all.
     """
     log = path_of(log)
-    refuse_ids(workspace, log, "inspect")
     if layout == AS_IT_SAYS and (workspace.folder / FILE).exists():
         with suppress(GroundedError):  # it is reported where [log] is used
             layout = layout_of(workspace.config.log)

@@ -37,7 +37,7 @@ from grounded_trials.workspace.candidates.search_state import (
     standing_of,
 )
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import refuse_ids, sha256
+from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
@@ -124,7 +124,6 @@ def ingest_log(
 
     With `ahead` the next candidate is planned if the next command depends on it, see `standing_in`.
     """
-    refuse_ids(workspace, path, "ingest")
     candidate = candidate and candidate_named(workspace, candidate)
     kind = "" if path.is_dir() else kind_of(path)
     if kind == CANDIDATE:
