@@ -25,7 +25,8 @@ ENTRIES: dict[str, Entry] = {
         "weights=finite and not negative,place=one state along an axis, two in a plane "
         "(horizontal first) or three,bool=True or False,dict=a dict by name,ascending=in "
         "ascending order,name=a valid Python name,trial=the gr.Trial of the run,"
-        "call=a function of a candidate that returns the Trial of its run,bounded=inside its bounds:}]][[ of the form {form}]][[ a {type}]]"
+        "call=a function of a candidate that returns the Trial of its run,"
+        "bounded=inside its bounds:}]][[ of the form {form}]][[ a {type}]]"
         "[[ of shape {shape}]][[ from "
         "{low}]][[ to {high}]][[ below {below}]][[: {known}]][[, such as {like}]][[, not "
         "{given}]][[: did you mean '{near}'?]]",
