@@ -22,6 +22,9 @@ MAGIC = b"\x89MCAP0\r\n"  # at the beginning and the end of a file
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
 MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
+_NAMES = {HEADER: "the header", SCHEMA: "a schema", CHANNEL: "a channel", MESSAGE: "a message"}
+_NAMES |= {CHUNK: "a chunk", ATTACHMENT: "an attached file", METADATA: "a table of metadata"}
+RECORD_HEAD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<16xQII")  # times; size when decompressed, its CRC, length of a name
 PIECE = 2**17  # [bytes] decompressed at once; what comes before an error is kept
 _U64 = struct.Struct("<Q")
@@ -122,6 +125,11 @@ class End:
 
 
 Record = Header | Schema | Channel | Messages | Rows | Attachment | Metadata | End
+
+
+def record_name(opcode: int) -> str:
+    """Return what to call a record."""
+    return _NAMES.get(opcode, f"a record of type {opcode}")
 
 
 def windows(buffer: bytes, dtype: str) -> NDArray[np.generic]:

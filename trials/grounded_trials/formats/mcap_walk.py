@@ -32,6 +32,7 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE,
     MESSAGE_HEADER,
     PARSERS,
+    RECORD_HEAD,
     SCHEMA,
     Channel,
     End,
@@ -41,14 +42,13 @@ from grounded_trials.formats.mcap_records import (
     Schema,
     batch,
     chunk_content,
+    record_name,
 )
 
 Data = bytes | mmap
 BLOCK = 4 * 2**20  # [bytes] of messages outside chunks in a batch
 
 PARSED = frozenset((*PARSERS, CHUNK, MESSAGE))
-_NAMES = {MESSAGE: "a message", CHUNK: "a chunk", SCHEMA: "a schema", CHANNEL: "a channel"}
-_HEAD = Struct("<BQ")
 _U32 = Struct("<I")
 
 
@@ -126,9 +126,9 @@ class _Walk:
         self._magic()
         while True:
             self.need(9, "a record's head")
-            opcode, length = _HEAD.unpack_from(self.data, self.pos)
+            opcode, length = RECORD_HEAD.unpack_from(self.data, self.pos)
             self.messages |= opcode in (CHUNK, MESSAGE)
-            self.need(9 + length, _NAMES.get(opcode, f"a record of type {opcode}"))
+            self.need(9 + length, record_name(opcode))
             if self.data_crc is None and opcode in PARSED:
                 if opcode == MESSAGE:
                     yield self._sound(self._run_of_messages(9 + length))
@@ -183,8 +183,7 @@ class _Walk:
             elif opcode in PARSERS:
                 yield self._sound(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
-            what = _NAMES.get(opcode, f"a record of type {opcode}")
-            raise self.damaged("record", what, error.finding.what, at) from None
+            raise self.damaged("record", record_name(opcode), error.finding.what, at) from None
 
     def _data_end(self, content: memoryview) -> None:
         stated = Fields(content).uint(32) if len(content) >= 4 else 0
@@ -233,7 +232,7 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
     while pos < end:
         some, pos = message_positions(data, pos, end)
         positions += some
-        opcode, length = _HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end - pos)
+        opcode, length = RECORD_HEAD.unpack_from(data, pos) if end - pos >= 9 else (0, end - pos)
         if pos < end and length > end - pos - 9:
             if cut:
                 break
@@ -254,7 +253,7 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
         BadRecord: for a message that is shorter than its header.
     """
     positions: list[int] = []
-    append, unpack = positions.append, _HEAD.unpack_from
+    append, unpack = positions.append, RECORD_HEAD.unpack_from
     while end - pos >= 9:
         opcode, length = unpack(buffer, pos)
         if opcode != MESSAGE or length > end - pos - 9:

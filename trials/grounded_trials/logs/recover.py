@@ -38,6 +38,7 @@ from grounded_trials.formats.mcap_records import (
     MESSAGE_INDEX,
     METADATA,
     PARSERS,
+    RECORD_HEAD,
     Attachment,
     Channel,
     Fields,
@@ -49,6 +50,7 @@ from grounded_trials.formats.mcap_records import (
     batch,
     chunk_content,
     decompress,
+    record_name,
 )
 from grounded_trials.formats.mcap_walk import Data, again, chunk_records, mapped, message_positions
 from grounded_trials.formats.mcap_writer import McapWriter
@@ -189,10 +191,7 @@ def _opened(copy: McapWriter, channel: Channel, schema: Schema | None) -> int:
     return copy.channel(channel.topic, channel.encoding, number, channel.metadata)
 
 
-_HEAD = Struct("<BQ")
 _SPAN = Struct("<QQ")  # a chunk's first and last time
-_NAMES = {1: "the header", 3: "a schema", 4: "a channel", 5: "a message", 6: "a block of messages"}
-_NAMES |= {9: "an attached file", 12: "a table of metadata"}
 CHAIN = 3  # consecutive plausible records after which a place is accepted
 
 
@@ -242,7 +241,7 @@ class Salvage:
             # A record, or a run of messages outside chunks.
             opcode, stop = self.data[pos], end
             if opcode == MESSAGE and (self._ended or before in (CHUNK, MESSAGE_INDEX)):
-                self.losses.append(found("file.lost", part=_NAMES[MESSAGE], byte=pos))
+                self.losses.append(found("file.lost", part=record_name(MESSAGE), byte=pos))
             elif opcode == MESSAGE:
                 while stop < self.size and self.data[stop] == MESSAGE:
                     if (further := self._end_of(stop)) is None:
@@ -284,7 +283,7 @@ class Salvage:
                 self._tables += opcode in (METADATA, ATTACHMENT)
                 yield from self._sound(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
-            what = _NAMES.get(opcode, f"a record of type {opcode}")
+            what = record_name(opcode)
             self.losses.append(found("file.lost", part=what, byte=pos, why=error.finding.what))
             if opcode == CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
@@ -333,7 +332,7 @@ class Salvage:
         """Return where the record there ends; None if there can't be one."""
         if self.size - pos < 9:
             return None
-        opcode, length = _HEAD.unpack_from(self.data, pos)
+        opcode, length = RECORD_HEAD.unpack_from(self.data, pos)
         end = pos + 9 + int(length)
         short = opcode == MESSAGE and length < MESSAGE_HEADER
         if opcode == 0 or opcode > DATA_END or end > self.size or short:

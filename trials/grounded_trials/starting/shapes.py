@@ -272,13 +272,11 @@ def _path(shape: str, drive: Drive) -> tuple[Array, Array, Array, Array]:
 
 def _reachable(along: Array, limit: Array, accel: float) -> Array:
     """Return the fastest speed profile within `limit` and `accel` that starts at rest."""
-    v = limit.copy()
-    v[0] = 0.0
-    for i in range(len(v) - 1):
-        v[i + 1] = min(v[i + 1], np.sqrt(v[i] ** 2 + 2 * accel * (along[i + 1] - along[i])))
-    for i in range(len(v) - 1, 0, -1):
-        v[i - 1] = min(v[i - 1], np.sqrt(v[i] ** 2 + 2 * accel * (along[i] - along[i - 1])))
-    return v
+    gain, square = 2 * accel * along, limit**2  # v^2 changes by no more than 2 accel times the way
+    square[0] = 0.0
+    square = gain + np.minimum.accumulate(square - gain)
+    square = np.minimum.accumulate((square + gain)[::-1])[::-1] - gain
+    return np.minimum(limit, np.sqrt(np.maximum(square, 0.0)))
 
 
 def step_target(
