@@ -3,7 +3,8 @@
 States that respond before their command is sent are on another clock, since no physics does that.
 Under feedback commands follow the states, so later commands help to predict; and a model with too
 much friction or lag is slower than the robot. So the later commands must act about as the model
-says, and leave much smaller errors than the commands up to then can, with gains and delays.
+says, and leave much smaller errors than the commands up to then can: through the model with gains,
+delays and quicker actuators, or through any law that is linear in them.
 
 How an input acts is judged by size. With everything linear in the states projected out (friction,
 springs and the feedback itself are), predictions are made with the input as it is, reversed and
@@ -97,7 +98,12 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
             k: as_told(k) for k in range(max(least, about - near), min(reach, about + near) + 1)
         }
         k = min(fits, key=lambda k: fits[k].score)
-        before = ahead.best([ones, 0.0 * ones])  # what past and present commands can do
+        # all that past and present commands can do
+        before = min(
+            ahead.best([ones, 0.0 * ones]),
+            ahead.whatever_commands_do().best([ones]),
+            key=lambda fit: fit.score,
+        )
     parts, gain = fits[k].rms / before.rms, before.score - fits[k].score
     if gain < MARGIN or parts.min() > HALF_ERROR:
         return None

@@ -3,7 +3,8 @@
 The model predicts as it is, or calibrated on the trial itself: uncertain parameters, a gain on
 every input and a common delay of the commands are fitted, and a constant rate of each state is
 removed. The remaining error is what no plain calibration explains.
-On request everything linear in the states (unmodelled friction, back-EMF, springs) is removed too.
+On request everything linear in the states (unmodelled friction, back-EMF, springs) or in the
+commands is removed as well.
 """
 
 from __future__ import annotations
@@ -178,6 +179,17 @@ class Ahead:
         off = self.model.difference(self.last, self.first)[:, self.shown]
         found[self.shown] = off.std(axis=0)
         return found
+
+    def whatever_commands_do(self) -> Ahead:
+        """Return a copy that also removes errors linear in the past and present commands."""
+        h, half = self.steps, max(1, self.steps // 2)
+        sums = np.concatenate([np.zeros((1, self.model.m)), np.cumsum(self.sent, axis=0)])
+        spans = [(-h, 0), (0, half)] + ([(half, h)] if half < h else [])
+        starts = [np.maximum(self.at + a, 0) for a, _ in spans]
+        told = [sums[self.at + b] - sums[a] for a, (_, b) in zip(starts, spans, strict=True)]
+        other = self._with(self.sent)
+        other.left_out = basis(np.hstack([self.left_out, *told]))
+        return other
 
     def plain(self, gains: Array) -> Fit:
         """Return the fit of the uncalibrated model with given gains (m,) of its inputs."""
