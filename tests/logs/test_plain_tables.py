@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -85,3 +86,29 @@ def test_three_commands_lead_to_a_diagnosis(
     assert len(Workspace("motor").trials()) == 2
     assert {"tau_w", "gain_w_u_cmd"} <= {*Workspace("motor").diagnose().verdict.parameters}
     assert grounded("-C", "motor", "inspect", "runs/run1.csv").code == 0
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet", "mat"])
+def test_columns_are_assigned_by_their_names_in_every_table(tmp_path: Path, kind: str) -> None:
+    t = np.arange(N) / RATE
+    names = ("pos_x", "pos_y", "heading_est", "ground_speed", "steering_cmd", "throttle_cmd")
+    columns = {"t": t} | {name: np.sin((k + 1) * t / 7) for k, name in enumerate(names)}
+    path = tmp_path / f"drive.{kind}"
+    if kind == "csv":
+        np.savetxt(
+            path,
+            np.column_stack([*columns.values()]),
+            "%.6f",
+            ",",
+            header=",".join(columns),
+            comments="",
+        )
+    elif kind == "mat":
+        pytest.importorskip("scipy.io").savemat(path, columns)
+    else:
+        arrow = pytest.importorskip("pyarrow", reason="needs the extra parquet")
+        pytest.importorskip("pyarrow.parquet").write_table(arrow.table(columns), path)
+    assert grounded("init", str(tmp_path / "robot"), "--from", str(path), "--yes").code == 0
+    log = tomllib.loads((tmp_path / "robot" / "grounded.toml").read_text())["log"]
+    assert log["state"]["psi"]["path"].endswith("heading_est")
+    assert log["input"]["steering"]["path"].endswith("steering_cmd")

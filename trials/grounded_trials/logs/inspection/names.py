@@ -72,6 +72,7 @@ PARTS = re.compile(
 )
 POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 _WORD = re.compile(r"[a-z]+")
+TABLES = ("npz", "csv", "parquet", "mat", "run")  # topics of tables: a column's name says it all
 _FLAT = re.compile(r"_(linear|angular)_(?=[xyz]$)")  # a Twist in a table: cmd_vel_linear_x
 _HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
 WORTH, LESS, TOPIC = 4.0, 0.3, 3.0  # points of the usual name, less of each further one
@@ -162,4 +163,4 @@ def _named(inside: str, last: str) -> str:
     """Return the text whose words name a number: a topic of one number, or a table's column."""
     if inside in ("data", "value"):
         return last
-    return "" if "." in inside or "[" in inside or last not in ("npz", "csv", "run") else inside
+    return "" if "." in inside or "[" in inside or last not in TABLES else inside
