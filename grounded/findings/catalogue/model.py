@@ -71,6 +71,13 @@ ENTRIES: dict[str, Entry] = {
     ),
     # an adoption
     "adopted": Entry("note", "adopted: {about}"),
+    "readings": Entry(
+        "note",
+        "targets and distances of {about} are in readings of its sensor[[, {bias} too {way}]]"
+        "[[, {by:%} too {way}]][[, {age} old]]",
+        "for true values correct the log ([[offset {offset:+.3g}]][[!offset? scale or delay_s]] in "
+        "[log.state]) and the robot's program, and remove the effect",
+    ),
     # taken home
     "no_place": Entry(
         "warn",

@@ -22,6 +22,7 @@ from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
+from grounded.model import Model
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_as, write_document
@@ -277,7 +278,8 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         left={name: one.value for name, one in left.items()},
         then=to_plan(workspace),
     )
-    told = []
+    named = [effect for effect in adopted if effect["name"] in asked]
+    told = [*_readings(workspace.base_model, named)]
     called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(before.values())}
     for name, e in left.items():
         was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
@@ -333,6 +335,21 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
         then = NextCommand("adopt", diagnosis.effects or (rivals[0],))
         raise refused("model.not_adoptable", *rivals, why="rival", then=then)
     return not rivals
+
+
+def _readings(model: Model, effects: Effects) -> Iterator[Finding]:
+    """Yield which states are in readings of their sensors, once these effects are adopted."""
+    for effect in effects:
+        family, _, state = str(effect["name"]).partition(":")
+        size = effect.get("b", effect.get("k", 0.0))
+        way = "low" if size < 0 else "high"
+        if family == "sensor_bias":
+            bias = Quantity(abs(size), model.states[state])
+            yield found("model.readings", state, bias=bias, way=way, offset=-size)
+        elif family == "sensor_scale":
+            yield found("model.readings", state, by=abs(size), way=way)
+        elif family == "sensor_delay":
+            yield found("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
 
 
 def undo_adoption(workspace: Folder) -> Undone:
