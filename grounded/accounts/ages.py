@@ -24,7 +24,6 @@ from grounded.accounts.finding import Finding
 from grounded.accounts.kinematics import Row, kinematic_rows, per_step, pieces, turned
 from grounded.accounts.lag import (
     COHERENT,
-    LEAST_S,
     REPORTED_FROM,
     SAME,
     SURELY,
@@ -33,6 +32,7 @@ from grounded.accounts.lag import (
     earlier,
     lag_between,
 )
+from grounded.accounts.motion import HALF_ERROR
 from grounded.accounts.signals import quantum
 from grounded.accounts.table import RPM
 from grounded.findings import Quantity
@@ -47,12 +47,8 @@ LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamp
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
-SAMPLES_PER_WEIGHT = 10  # samples per weight
-CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
-UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
-UNSURE = 0.25  # of a delay: a larger uncertainty, or remainder, of two positions shows none
 
 
 class Ages:
@@ -152,7 +148,7 @@ class Ages:
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Correct a delay beyond the model's own; the later sensor has it, since none is early."""
-        d, least = float(abs(lag.delay)), max(LEAST_STEPS * self.dt, LEAST_S)
+        d, least = float(abs(lag.delay)), LEAST_STEPS * self.dt
         own = own_lag(self.model, relation, self.trials) if relation.exact else 0.0
         beyond = max(min(own, 0.0) - lag.delay, lag.delay - max(own, 0.0))
         q, w = (self.names[k] for k in (relation.i, relation.j))
@@ -323,7 +319,7 @@ def _weighed(
     long = [(moved / dt, w) for _, moved, w in logs if len(moved) >= length]
     rows = [np.lib.stride_tricks.sliding_window_view(rate, length)[:, ::-1] for rate, _ in long]
     count = sum(map(len, rows))
-    if count < SAMPLES_PER_WEIGHT * length:
+    if count < 2 * length:
         return None
     a = np.concatenate(rows)
     w = np.concatenate([w[past : past + len(r)] for (_, w), r in zip(long, rows, strict=True)])
@@ -332,9 +328,8 @@ def _weighed(
     left = float(np.sqrt(rest @ rest / count))
     # the velocity must carry the position's noise as its weights would
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
-    explained = left < min(UNEXPLAINED * float(np.sqrt(w @ w / count)), CARRIED * passed)
     gain = float(weights.sum())
-    if rank < length or not explained or abs(gain - 1) > OFF:
+    if rank < length or left >= passed or abs(gain - 1) > OFF:
         return None
     covariance = np.linalg.inv(a.T @ a) * left**2
     ages = (np.arange(length) - LATER + 0.5) * dt
@@ -394,7 +389,7 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
     apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
     least = max(REPORTED_FROM * lag.std, 0.5 * dt)
     left = _left(ways, lag.delay / dt, dt, apart=apart) if lag.delay >= least else [(0.0, np.inf)]
-    sure = all(max(std, abs(late) - SURELY * std) < UNSURE * lag.delay for late, std in left)
+    sure = all(max(std, abs(late) - SURELY * std) < HALF_ERROR * lag.delay for late, std in left)
     return lag if sure else None
 
 

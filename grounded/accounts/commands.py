@@ -24,7 +24,6 @@ from grounded.accounts.motion import (
     FEWEST_SAMPLES,
     HALF_ERROR,
     HINT,
-    HORIZONS,
     LIKE,
     MARGIN,
     Ahead,
@@ -39,9 +38,9 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
 
+AHEAD_S = (0.25, 1.0)  # [s] how far ahead an input is judged
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift; calibrated near it
 STARTS = 120  # samples to predict from
-DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] a swing turns round what is late
 SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
 OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
 
@@ -78,7 +77,7 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
         return None
     seen = known_states(trial, shown)
     trial, known = _with_differences(model, trial, seen)
-    ahead = Ahead(model, trial, known, STARTS, DELAYS, linear=True, early=reach)
+    ahead = Ahead(model, trial, known, STARTS, linear=True, horizon=AHEAD_S[0], early=reach)
     ones = np.ones(model.m)
 
     def as_told(k: int) -> Fit:
@@ -159,8 +158,8 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
         return (UNKNOWN,) * model.m
     found = list[tuple[Array, Array]]()
     with np.errstate(all="ignore"):
-        for seconds in HORIZONS[::2]:
-            ahead = Ahead(model, known, some, STARTS, DELAYS, linear=True, horizon=seconds)
+        for seconds in AHEAD_S:
+            ahead = Ahead(model, known, some, STARTS, linear=True, horizon=seconds)
             if ahead.enough:
                 found.append(_scores(ahead))
     return tuple(_acts([(nats[j], shares[j]) for nats, shares in found]) for j in range(model.m))
@@ -221,7 +220,7 @@ def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
     the model lacks leaves less of an input the longer it acts.
     """
     known = [(nats, share) for nats, share in each if np.isfinite(nats).all()]
-    if len(known) < len(HORIZONS[::2]):
+    if len(known) < len(AHEAD_S):
         return UNKNOWN
     leads = [
         float(np.delete(nats, k).min() - nats[k]) for nats, _ in known for k in [nats.argmin()]

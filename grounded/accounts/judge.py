@@ -17,6 +17,7 @@ import numpy as np
 
 from grounded.accounts.kinematics import Gap, Row, away, gaps, kinematic_rows, turned
 from grounded.accounts.motion import (
+    AHEAD_S,
     FLOOR,
     HALF_ERROR,
     HINT,
@@ -25,7 +26,6 @@ from grounded.accounts.motion import (
     SHORTLIST,
     Ahead,
     Fit,
-    horizon_of,
     known_states,
     plainly_missed,
 )
@@ -38,7 +38,7 @@ from grounded.trial import Trial
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 BETTER = 3.0  # factor by which its share must fall to be mended
 OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
-TURNED_AWAY, SNAPPED = np.deg2rad(20), np.deg2rad(4)  # more than side slip; a right angle
+SNAPPED = np.deg2rad(4)  # a heading that is off by a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
 GROSS = 20.0  # a gross factor; of a trial that is as much larger than others: it is examined
@@ -98,9 +98,8 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
         account: the fault, of another trial.
     """
     known, ones = known_states(trial, shown), np.ones(model.m)
-    seconds = horizon_of(trial, known)
     logged, mended = (  # a command at its limit may make a constant rate
-        Ahead(model, one, known, 2 * STARTS, constant=False, horizon=seconds)
+        Ahead(model, one, known, 2 * STARTS, constant=False)
         for one in (trial, account.mended(trial))
     )
     if not (logged.enough and mended.enough):
@@ -151,8 +150,6 @@ class _ByRows:
         self.sound = [k for k, one in enumerate(self.each) if not _bad(one)]
         self.plane = turned(model) if any(len(row.by) > 1 for row in rows) else None
         self.units = list(model.states.values())
-        sizes = [_spread(trials[k].states) for k in self.sound]
-        self.usual = np.median(sizes, axis=0) if sizes else None
 
     def told(self) -> list[Told]:
         """Return the fewest accounts after which all rows agree, of trials with one fault."""
@@ -234,8 +231,6 @@ class _ByRows:
             mended = [account.mended(trial) for trial in trials]
             if account.fitted and self.plane is not None:
                 turn = away(self.model, mended, self.rows, self.plane)
-                if abs(turn) < TURNED_AWAY:
-                    continue
                 account = replace(account, offset=turn)
                 mended = [account.mended(trial) for trial in trials]
             entered = [row for row in before if row.states & account.touched]
@@ -245,17 +240,16 @@ class _ByRows:
             agree = all(row in after and _agrees(before[row], after[row]) for row in entered)
             if agree and _of_this_size(account, after):
                 gained = sum(_nats(after[row]) - _nats(before[row]) for row in entered)
-                cost[account] = gained + account.price + self._strange(account, mended[0])
+                cost[account] = gained + account.price
         if not cost:
             return None
         # accounts that mend the same rows are told apart by the motion
         least = min(cost.values())
         near = [account for account in cost if cost[account] < least + 3 * MARGIN]
         if len(near) > 1 and "dead" not in {one.kind for one in near}:
-            ahead = horizon_of(trials[0], self.shown)
             for account in near:
                 run = account.mended(trials[0])
-                made = Ahead(self.model, run, known_states(run, self.shown), STARTS, horizon=ahead)
+                made = Ahead(self.model, run, known_states(run, self.shown), STARTS)
                 if made.enough:
                     cost[account] += made.best([np.ones(self.model.m)], free=False).missed
         first, *rest = sorted(near, key=lambda account: cost[account])
@@ -265,14 +259,6 @@ class _ByRows:
             if cost[one] < cost[first] + MARGIN and not one.touched > first.touched
         )
         return _Best(first, -least, others)
-
-    def _strange(self, account: Account, mended: Trial) -> float:
-        """Return how unlike other trials the columns of a trial are in size [nats]."""
-        some = [k for k in account.touched if k < self.model.n]
-        if self.usual is None or account.kind in ("pace", "dead"):
-            return 0.0
-        size = _spread(mended.states)[some]
-        return float(np.minimum(np.abs(np.log(size / self.usual[some])), 3 * MARGIN).sum())
 
 
 def _spread(x: Array, about: float | None = None) -> Array:
@@ -332,7 +318,7 @@ def _by_motion(
     near = tuple(one for one in others if cost[one] < cost[best] + MARGIN and one.kind == best.kind)
     k, (before, after) = next(iter(whole[best].items()))
     i = int(np.argmin(after.share / before.share))
-    seen = (i, float(before.rms[i]), float(after.rms[i]), examined[k].seconds)
+    seen = (i, float(before.rms[i]), float(after.rms[i]), AHEAD_S)
     gain = float(np.mean([b.missed - a.missed for b, a in whole[best].values()]))
     which = tuple(whole[best]) if against[best] else tuple(range(len(trials)))
     yield Told(best, which, gain, near, len(which) == len(trials), seen)
@@ -366,8 +352,8 @@ class _Seen:
         table: Sequence[Account],
     ) -> None:
         self.model, self.trial, self.known = model, trial, known_states(trial, shown)
-        self.seconds, self.gaps = horizon_of(trial, shown), gaps(model, trial, rows)
-        self.logged = Ahead(model, trial, self.known, STARTS, horizon=self.seconds)
+        self.gaps = gaps(model, trial, rows)
+        self.logged = Ahead(model, trial, self.known, STARTS)
         unknown = {i for i in range(model.n) if i not in self.known}
         self.gains = dict[Account, float]()
         some = [one for one in table if not one.touched & unknown]
@@ -382,7 +368,7 @@ class _Seen:
         )
         for account in [one for one in likely if self._allowed(one)][:SHORTLIST]:
             mended = account.mended(self.trial)
-            ahead = Ahead(self.model, mended, self.known, STARTS, horizon=self.seconds)
+            ahead = Ahead(self.model, mended, self.known, STARTS)
             if ahead.enough and (fits := _compared(self.model, self.logged, ahead, account)):
                 yield account, fits
 

@@ -27,7 +27,6 @@ STRETCH = 0.3  # [s] shortest stretch
 FEWEST_STRETCHES = 8  # stretches that a trial must hold
 NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
 ZERO_RATE = 1e-4  # of a rate, or of its largest derivative: treated as zero
-STEADY = 0.01  # of a motion's mean square: a smaller variance is a constant velocity
 
 
 @dataclass(frozen=True)
@@ -157,9 +156,7 @@ def _over(
             told[:, row.i] *= np.clip(times, row.low, row.high)
     moved, said, off = _size(far), _size(told), _size(far - told)
     varying, power = np.std(far - told, axis=0), told.var(axis=0)
-    steady = power < STEADY * said**2  # at a constant velocity a drift is no drift
-    power = np.where(steady, said**2, power)
-    both = (far * (told - ~steady * told.mean(axis=0))).mean(axis=0)
+    both = (far * (told - told.mean(axis=0))).mean(axis=0)
     for row in rows:
         i, same = row.i, [one.i for one in rows if units[one.i] == units[row.i]]
         size = float(max(moved[i], said[i], np.sqrt((said[same] ** 2).mean())))

@@ -1,4 +1,4 @@
-"""The motion given the model: predictions of one trial 0.25 to 1 s ahead, from many samples.
+"""The motion given the model: predictions of one trial half a second ahead, from many samples.
 
 The model predicts as it is, or calibrated on the trial itself: uncertain parameters, a gain on
 every input and a common delay of the commands are fitted, and a constant rate of each state is
@@ -15,28 +15,26 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.frozen import Array, median, white_noise
+from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import motion, true_values
 from grounded.rollout import stepper
 from grounded.trial import Trial
 
-AHEAD_S = 0.25  # [s]
+AHEAD_S = 0.5  # [s]
 STATES_BOUND = 1e9  # bound on predicted states
-HORIZONS, LOUD = (AHEAD_S, 0.5, 1.0), 4.0  # [s] tried in turn; motion over noise that is enough
 FLOOR = 0.05  # of a motion: smaller errors count as this
-DELAYS = (0.0, 0.05, 0.1, 0.2)  # [s] command delays tried
+DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] command delays tried
 FEWEST_SAMPLES = 20  # fewest samples
 # smallest error that counts: of a state's spread, and in its unit
 SMALLEST_ERROR, TINY = 1e-3, 1e-12
-ROUNDS, DAMPING, SLOPE = 5, (1.0, 0.3, 0.1), 0.02  # iterations, step sizes, difference step
+ROUNDS, SLOPE = 5, 0.02  # iterations, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
 MARGIN = 0.8  # [nats] by which any account must lead the others: the one margin
 SHORTLIST = 8  # accounts of a table that are compared in full
 HINT = MARGIN / 2  # [nats] of plain predictions that are looked at
 HALF_ERROR = 0.5  # share of one error
 LIKE = 4.0  # factor within which an input must act as in the model
-LAST_GAIN = 0.01  # [nats] smallest gain of an iteration: below it the fit stops
 
 Steps = NDArray[np.intp]
 
@@ -68,20 +66,6 @@ def starts_from(model: Model, states: Array, shown: Sequence[int]) -> Array:
 def known_states(trial: Trial, shown: Sequence[int]) -> list[int]:
     """Return which of the states with a sensor have a value in a trial."""
     return [i for i in shown if np.isfinite(trial.states[:, i]).any()]
-
-
-def horizon_of(trial: Trial, shown: Sequence[int]) -> float:
-    """Return how far ahead to predict [s]: until most states move by more than their noise."""
-    noise = np.maximum(white_noise(trial.states[:, list(shown)]), TINY)
-    for seconds in HORIZONS:
-        steps = max(1, round(seconds / trial.dt))
-        moved = trial.states[steps:, list(shown)] - trial.states[:-steps, list(shown)]
-        known = np.isfinite(moved).all(axis=0)
-        if len(moved) < FEWEST_SAMPLES or not known.any():
-            return seconds
-        if median((moved.std(axis=0) / noise)[known]) > LOUD:
-            return seconds
-    return HORIZONS[-1]
 
 
 @dataclass(frozen=True)
@@ -254,13 +238,10 @@ class Ahead:
                 break  # the prediction diverges
             H = J.T @ J + np.diag(prior + 1e-9 * len(white))
             step = -np.linalg.lstsq(H, J.T @ white + prior * theta, rcond=None)[0]
-            for part in DAMPING:
-                (new,) = off((theta + part * step)[None])
-                if np.log(self.size(new) / size).sum() < -LAST_GAIN:
-                    break
-            else:
+            (new,) = off((theta + step)[None])
+            if not np.log(self.size(new) / size).sum() < 0:
                 break
-            theta, r, size = theta + part * step, new, self.size(new)
+            theta, r, size = theta + step, new, self.size(new)
         found = gains.copy()
         found[:m] += theta[:m]
         return self._fit(size, found)

@@ -22,13 +22,15 @@ import numpy as np
 from grounded.accounts.motion import MARGIN, SHORTLIST
 from grounded.accounts.reported import tables
 from grounded.accounts.sent import (
-    CLEAR,
     DECISIVE,
+    EXACT,
     EXPLAINED,
     FINE,
+    LATEST,
     SAME,
     SLIGHT,
     STEPS_TO_JUDGE,
+    UNLIKE,
     Following,
     Ran,
     apart,
@@ -49,7 +51,6 @@ from grounded.trial import Trial
 
 OTHERS = 20  # number of latest candidates to compare with
 TIMES = {"ms": 1e3, "a clock": np.inf, "no unit: it stays 0": 0.0}  # in place of seconds
-UNSENT, LOST = 5, 0.3  # steps before the first command, and share of all, that are not run
 SHARES = np.arange(1, 49) / 50  # of its last value that a first-order filter keeps
 
 
@@ -178,7 +179,7 @@ def stories(
     Returns:
         The stories, the likeliest first.
     """
-    if plain is None or (plain.alike and plain.error < CLEAR) or not trial.inputs.any():
+    if plain is None or (plain.alike and plain.error < EXACT) or not trial.inputs.any():
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
@@ -496,9 +497,9 @@ def _held(own: Ran, trial: Trial) -> Iterator[Row]:
     same = np.zeros(policy.horizon, bool)
     same[:T] = (np.abs(trial.inputs[:T] - before) <= 1e-9).all(axis=1)
     unsent, changed = int(np.argmin(same)), np.flatnonzero(~same[:T])
-    if unsent > UNSENT:
+    if unsent > LATEST:
         story = _passed("run.unsent", own, steps=unsent)
-    elif len(changed) >= STEPS_TO_JUDGE and same.mean() > LOST:
+    elif len(changed) >= STEPS_TO_JUDGE and same.mean() > UNLIKE:
         every, dt = 1e3 * policy.dt * float(np.median(np.diff(changed))), 1e3 * policy.dt
         story = _passed("run.skipped", own, lost=float(same.mean()), every=every, dt=dt)
     else:
@@ -582,7 +583,7 @@ def suspicion(
     alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]
     if sure := [one for one in alike if one[2] > DECISIVE]:
         left, name, nats = min(sure)
-        near = name if left < max(CLEAR, SAME * ran.error) else ""
+        near = name if left < max(EXACT, SAME * ran.error) else ""
         return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
     some = cache(partial(stories, task, own, trial, ran, logged=logged))
     if ran.alike:

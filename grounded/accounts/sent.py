@@ -26,7 +26,7 @@ STEPS_TO_JUDGE = 10  # smallest number of steps that can be judged
 UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
 DECISIVE = 8.0  # [nats] of evidence that another candidate ran
-SAME, CLEAR = 0.5, 0.01  # shares: of another difference, and of an input, that count as none
+SAME = 0.5  # share of another difference that counts as none
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
 # differences of commands, relative to their size: of rounding, none, hardly any, alike, explained
 DIGITS, EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-5, 1e-3, 0.02, 0.05, 0.1
