@@ -21,6 +21,7 @@ import numpy as np
 
 from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.motion import (
+    AHEAD_S,
     FEWEST_SAMPLES,
     HALF_ERROR,
     HINT,
@@ -38,7 +39,7 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
 
-AHEAD_S = (0.25, 1.0)  # [s] how far ahead an input is judged
+HORIZONS = (AHEAD_S, 1.0)  # [s] how far ahead an input is judged
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift; calibrated near it
 STARTS = 120  # samples to predict from
 SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
@@ -77,7 +78,7 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
         return None
     seen = known_states(trial, shown)
     trial, known = _with_differences(model, trial, seen)
-    ahead = Ahead(model, trial, known, STARTS, linear=True, horizon=AHEAD_S[0], early=reach)
+    ahead = Ahead(model, trial, known, STARTS, linear=True, early=reach)
     ones = np.ones(model.m)
 
     def as_told(k: int) -> Fit:
@@ -158,7 +159,7 @@ def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Ac
         return (UNKNOWN,) * model.m
     found = list[tuple[Array, Array]]()
     with np.errstate(all="ignore"):
-        for seconds in AHEAD_S:
+        for seconds in HORIZONS:
             ahead = Ahead(model, known, some, STARTS, linear=True, horizon=seconds)
             if ahead.enough:
                 found.append(_scores(ahead))
@@ -220,7 +221,7 @@ def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
     the model lacks leaves less of an input the longer it acts.
     """
     known = [(nats, share) for nats, share in each if np.isfinite(nats).all()]
-    if len(known) < len(AHEAD_S):
+    if len(known) < len(HORIZONS):
         return UNKNOWN
     leads = [
         float(np.delete(nats, k).min() - nats[k]) for nats, _ in known for k in [nats.argmin()]

@@ -17,7 +17,6 @@ import numpy as np
 
 from grounded.accounts.kinematics import Gap, Row, away, gaps, kinematic_rows, turned
 from grounded.accounts.motion import (
-    AHEAD_S,
     FLOOR,
     HALF_ERROR,
     HINT,
@@ -38,6 +37,7 @@ from grounded.trial import Trial
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 BETTER = 3.0  # factor by which its share must fall to be mended
 OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
+AHEAD_S = 0.5  # [s] of predictions
 SNAPPED = np.deg2rad(4)  # a heading that is off by a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
@@ -99,7 +99,7 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
     """
     known, ones = known_states(trial, shown), np.ones(model.m)
     logged, mended = (  # a command at its limit may make a constant rate
-        Ahead(model, one, known, 2 * STARTS, constant=False)
+        Ahead(model, one, known, 2 * STARTS, constant=False, horizon=AHEAD_S)
         for one in (trial, account.mended(trial))
     )
     if not (logged.enough and mended.enough):
@@ -249,7 +249,9 @@ class _ByRows:
         if len(near) > 1 and "dead" not in {one.kind for one in near}:
             for account in near:
                 run = account.mended(trials[0])
-                made = Ahead(self.model, run, known_states(run, self.shown), STARTS)
+                made = Ahead(
+                    self.model, run, known_states(run, self.shown), STARTS, horizon=AHEAD_S
+                )
                 if made.enough:
                     cost[account] += made.best([np.ones(self.model.m)], free=False).missed
         first, *rest = sorted(near, key=lambda account: cost[account])
@@ -353,7 +355,7 @@ class _Seen:
     ) -> None:
         self.model, self.trial, self.known = model, trial, known_states(trial, shown)
         self.gaps = gaps(model, trial, rows)
-        self.logged = Ahead(model, trial, self.known, STARTS)
+        self.logged = Ahead(model, trial, self.known, STARTS, horizon=AHEAD_S)
         unknown = {i for i in range(model.n) if i not in self.known}
         self.gains = dict[Account, float]()
         some = [one for one in table if not one.touched & unknown]
@@ -368,7 +370,7 @@ class _Seen:
         )
         for account in [one for one in likely if self._allowed(one)][:SHORTLIST]:
             mended = account.mended(self.trial)
-            ahead = Ahead(self.model, mended, self.known, STARTS)
+            ahead = Ahead(self.model, mended, self.known, STARTS, horizon=AHEAD_S)
             if ahead.enough and (fits := _compared(self.model, self.logged, ahead, account)):
                 yield account, fits
 

@@ -17,13 +17,13 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.motion import FEWEST_SAMPLES
 from grounded.frozen import Array
 
 Pairs = Sequence[tuple[Array, Array]]
 
 LARGEST_DELAY_S, LARGEST_DELAY_STEPS = 0.3, 6  # the larger of both is tried
 WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samples
+SHORTEST = 24  # samples in the shortest pair used
 COHERENT = 0.9  # coherence below which a window is ignored
 BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertainty
 REPORTED_FROM = 5.0  # standard deviations above which a delay or a bias is reported
@@ -136,7 +136,7 @@ class _Pieces:
 def _smoothed(pairs: Pairs, h: int, reach: int) -> _Pieces:
     window = np.hanning(2 * h + 3)[1:-1]
     window /= window.sum()
-    long = [(a, b) for a, b in pairs if len(a) >= max(FEWEST_SAMPLES, 2 * (h + reach) + 4)]
+    long = [(a, b) for a, b in pairs if len(a) >= max(SHORTEST, 2 * (h + reach) + 4)]
     a, b = ([np.convolve(pair[k], window, "valid") for pair in long] for k in (0, 1))
     return _Pieces([one[reach:-reach] for one in a], b, reach, h)
 

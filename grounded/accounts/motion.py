@@ -1,4 +1,4 @@
-"""The motion given the model: predictions of one trial half a second ahead, from many samples.
+"""The motion given the model: predictions of one trial 0.25 to 1 s ahead, from many samples.
 
 The model predicts as it is, or calibrated on the trial itself: uncertain parameters, a gain on
 every input and a common delay of the commands are fitted, and a constant rate of each state is
@@ -21,7 +21,7 @@ from grounded.places import motion, true_values
 from grounded.rollout import stepper
 from grounded.trial import Trial
 
-AHEAD_S = 0.5  # [s]
+AHEAD_S = 0.25  # [s]
 STATES_BOUND = 1e9  # bound on predicted states
 FLOOR = 0.05  # of a motion: smaller errors count as this
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] command delays tried
