@@ -32,7 +32,6 @@ from grounded.accounts.lag import (
     earlier,
     lag_between,
 )
-from grounded.accounts.motion import HALF_ERROR
 from grounded.accounts.signals import quantum
 from grounded.accounts.table import RPM
 from grounded.findings import Quantity
@@ -48,6 +47,7 @@ OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
+UNSURE = 0.25  # of a delay: a larger uncertainty, or remainder, of two positions shows none
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
 
 
@@ -389,7 +389,7 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
     apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
     least = max(REPORTED_FROM * lag.std, 0.5 * dt)
     left = _left(ways, lag.delay / dt, dt, apart=apart) if lag.delay >= least else [(0.0, np.inf)]
-    sure = all(max(std, abs(late) - SURELY * std) < HALF_ERROR * lag.delay for late, std in left)
+    sure = all(max(std, abs(late) - SURELY * std) < UNSURE * lag.delay for late, std in left)
     return lag if sure else None
 
 
