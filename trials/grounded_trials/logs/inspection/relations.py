@@ -87,11 +87,6 @@ class Signals:
 
     def __init__(self, log: LogReport, angles: Collection[str], stated: Stated) -> None:
         self.stated = stated
-        self._clocks = {
-            f.path: "header" if t.stamped and not log.simulated else "log"
-            for t in log.topics
-            for f in t.fields
-        }
         self._log, self._angles = log, angles
         self.found: dict[str, Samples] = {}
         self._missing: set[str] = set()
@@ -99,7 +94,8 @@ class Signals:
     def read(self, paths: Iterable[str]) -> None:
         """Read the samples of further paths."""
         more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
-        specs = {p: SignalSpec(p, clock=self._clocks.get(p, "log")) for p in more}  # type: ignore[arg-type]
+        clocks = {p: self._log.clock(self._log.topic_of(p)) for p in more}
+        specs = {p: SignalSpec(p, clock=clock) for p, clock in clocks.items()}  # type: ignore[arg-type]
         try:
             series = read_signals(self._log.files, specs, self._log.layout) if specs else {}
         except OverBudget:
