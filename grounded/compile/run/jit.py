@@ -1,15 +1,16 @@
 """LLVM IR text to functions, by llvmlite, through a cache on disk.
 
-Compiling takes a tenth of a second, loading a cached object a millisecond. Kernels are called
-through ctypes, which releases the GIL while they run: threads are enough for many models or trials
-(`grounded.engine`).
+Compiling takes a tenth of a second, loading a cached object a millisecond, without LLVM, which
+takes thirty to import (`object_file.py`). Kernels are called through ctypes, which releases the GIL
+while they run: threads are enough for many models or trials (`grounded.engine`).
 
-The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code. A
+The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code; and
+one file a machine, what LLVM said of it, which holds until it is started again. A
 file that is short, damaged or of another format is not used and is replaced; a file or folder that
-is not the user's, or that others may write, is not used at all. A file is written under a temporary
-name and renamed, so that any number of processes may share the folder; beyond MAX_BYTES the files
-that were used longest ago go. Without a cache (a read-only home) kernels are compiled again.
-GROUNDED_CACHE names another folder; empty, it switches the cache off.
+is not the user's, or that others may write, is not used at all. A file is written
+under a temporary name and renamed, so that any number of processes may share the folder; beyond
+MAX_BYTES the files that were used longest ago go. Without a cache (a read-only home) kernels are
+compiled again. GROUNDED_CACHE names another folder; empty, it switches the cache off.
 """
 
 from __future__ import annotations
@@ -26,25 +27,56 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from grounded.compile.run.object_file import load
 from grounded.trusted import suspicion
 
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
 MAGIC = b"grounded kernel 1\n"
 MAX_BYTES = 64 * 2**20  # of all files
-KERNEL = ".kernel"  # a kind of file
+KERNEL, MACHINE = ".kernel", ".machine"  # kinds of files
+BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux: another one each time it is started
 _LOCK = threading.Lock()
 
 
 @cache
 def _host() -> tuple[str, str, str]:
     """CPU name, its features, and everything that makes compiled code fit here and now."""
+    if (known := _remembered()) is not None:
+        return known
     import llvmlite
     import llvmlite.binding as llvm
 
     name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     version = ".".join(str(v) for v in llvm.llvm_version_info)
     triple = llvm.get_process_triple()
-    return name, features, f"{llvmlite.__version__} {version} {triple} {name} {features}"
+    found = name, features, f"{llvmlite.__version__} {version} {triple} {name} {features}"
+    if digest := _here():
+        store(digest, "\n".join(found).encode(), MACHINE)
+    return found
+
+
+def _remembered() -> tuple[str, str, str] | None:
+    """What LLVM said of this machine since it was started; None if it was not asked."""
+    digest = _here()
+    said = stored(digest, MACHINE) if digest else None
+    if said is None:
+        return None
+    name, features, whole = said.decode().split("\n")
+    return name, features, whole
+
+
+@cache
+def _here() -> str:
+    """A hash of this machine, from its start to its end, and of LLVM; "" where none is known."""
+    import llvmlite
+
+    try:
+        started = BOOT.read_text()
+        own = (Path(llvmlite.__file__).parent / "binding" / "libllvmlite.so").stat()
+    except OSError:
+        return ""
+    about = f"{started} {llvmlite.__version__} {own.st_size} {own.st_mtime_ns}"
+    return hashlib.sha256(about.encode()).hexdigest()
 
 
 def _machine() -> Any:
@@ -107,7 +139,7 @@ def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library
         if code is None:
             code = _compiled(write())
             store(digest, code)
-        return Library(_loaded(code), names)
+        return Library(load(code) or _loaded(code), names)
 
 
 def _compiled(text: str) -> bytes:
@@ -121,10 +153,11 @@ def _compiled(text: str) -> bytes:
 
 
 def _loaded(code: bytes) -> Any:
-    """An engine with the functions of an object file."""
+    """LLVM's own loader of an object file, with the file in it."""
     import llvmlite.binding as llvm
 
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+    machine = _machine()
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     return engine
@@ -208,7 +241,7 @@ def _check(digest: str, code: bytes) -> bytes:
 def _prune(home: Path) -> None:
     """Removes the files that were used longest ago until MAX_BYTES are left."""
     entries = []
-    for path in home.glob(f"*{KERNEL}"):
+    for path in (path for kind in (KERNEL, MACHINE) for path in home.glob(f"*{kind}")):
         with contextlib.suppress(OSError):
             status = path.stat()
             entries.append((status.st_mtime, status.st_size, path))
