@@ -15,7 +15,7 @@ from grounded_cli.console.terminal import bar, show, table
 
 # name -> (function, meaning of --seeds, see `_seeds`, or "" if it takes none, summary)
 STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
-    "flight": (flight.run, "count", "Table 1, Figure 1"),
+    "flight": (flight.run, "count", "Table 1"),
     "car": (car.run, "seeds", "Figures 4, 5"),
     "footnote9": (footnote9.run, "", "footnote 9"),
     "theorem1": (theorem1.run, "seeds", "theorem 1"),

@@ -90,8 +90,9 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
         if not ahead.enough:
             return None
         # the shift that the model as it is likes best, then its neighbours, calibrated
-        moved = ahead.scores(ones, -np.arange(least, reach + 1))
-        about = least + int(np.argmin(moved))
+        shifts = np.arange(least, reach + 1, near)
+        moved = ahead.scores(ones, -shifts)
+        about = int(shifts[np.argmin(moved)])
         if moved.min() > ahead.plain(ones).score - HINT:
             return None
         fits = {

@@ -26,9 +26,8 @@ class Finding(Document):
         signal: a state or an input, or several joined by "+".
         said: what is wrong with it, as an entry of the catalogue.
         kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
-            missing, quantised, saturated, beyond (its limits), constant, copy, mismatch (with
-            others), unresolved (too fast for the model's time step) or time step (of the
-            integrator, which is too long for the model).
+            mismatch (with others), unresolved (too fast for the model's time step) or time step (of
+            the integrator, which is too long for the model).
         delay_s: delay of the signal [s].
         std_s: standard deviation of the delay [s].
         scale: measured value over true value.

@@ -37,7 +37,7 @@ from grounded.trial import Trial
 BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
 BETTER = 3.0  # factor by which its share must fall to be mended
 OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
-AHEAD_S = 0.5  # [s] of predictions
+JUDGED_S = 0.5  # [s] of predictions
 SNAPPED = np.deg2rad(4)  # a heading that is off by a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
@@ -99,7 +99,7 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
     """
     known, ones = known_states(trial, shown), np.ones(model.m)
     logged, mended = (  # a command at its limit may make a constant rate
-        Ahead(model, one, known, 2 * STARTS, constant=False, horizon=AHEAD_S)
+        Ahead(model, one, known, 2 * STARTS, constant=False, horizon=JUDGED_S)
         for one in (trial, account.mended(trial))
     )
     if not (logged.enough and mended.enough):
@@ -250,7 +250,7 @@ class _ByRows:
             for account in near:
                 run = account.mended(trials[0])
                 made = Ahead(
-                    self.model, run, known_states(run, self.shown), STARTS, horizon=AHEAD_S
+                    self.model, run, known_states(run, self.shown), STARTS, horizon=JUDGED_S
                 )
                 if made.enough:
                     cost[account] += made.best([np.ones(self.model.m)], free=False).missed
@@ -320,7 +320,7 @@ def _by_motion(
     near = tuple(one for one in others if cost[one] < cost[best] + MARGIN and one.kind == best.kind)
     k, (before, after) = next(iter(whole[best].items()))
     i = int(np.argmin(after.share / before.share))
-    seen = (i, float(before.rms[i]), float(after.rms[i]), AHEAD_S)
+    seen = (i, float(before.rms[i]), float(after.rms[i]), JUDGED_S)
     gain = float(np.mean([b.missed - a.missed for b, a in whole[best].values()]))
     which = tuple(whole[best]) if against[best] else tuple(range(len(trials)))
     yield Told(best, which, gain, near, len(which) == len(trials), seen)
@@ -355,7 +355,7 @@ class _Seen:
     ) -> None:
         self.model, self.trial, self.known = model, trial, known_states(trial, shown)
         self.gaps = gaps(model, trial, rows)
-        self.logged = Ahead(model, trial, self.known, STARTS, horizon=AHEAD_S)
+        self.logged = Ahead(model, trial, self.known, STARTS, horizon=JUDGED_S)
         unknown = {i for i in range(model.n) if i not in self.known}
         self.gains = dict[Account, float]()
         some = [one for one in table if not one.touched & unknown]
@@ -370,7 +370,7 @@ class _Seen:
         )
         for account in [one for one in likely if self._allowed(one)][:SHORTLIST]:
             mended = account.mended(self.trial)
-            ahead = Ahead(self.model, mended, self.known, STARTS, horizon=AHEAD_S)
+            ahead = Ahead(self.model, mended, self.known, STARTS, horizon=JUDGED_S)
             if ahead.enough and (fits := _compared(self.model, self.logged, ahead, account)):
                 yield account, fits
 

@@ -103,7 +103,6 @@ def scored(
     own: Ran,
     run: Trial,
     error: float,
-    first: int = 0,
     **other: Any,
 ) -> Story:
     """Return a story with its score.
@@ -114,10 +113,9 @@ def scored(
         own: the candidate whose commands these are.
         run: the trial as it was by the story.
         error: what is left of the commands, relative to their size.
-        first: step of the run with which the trial begins.
         other: further fields of `Story`.
     """
-    return Story(kind, finding, float(np.log(error + FINE)), apart(own, run, first), **other)
+    return Story(kind, finding, float(np.log(error + FINE)), apart(own, run), **other)
 
 
 def likeliest(some: Iterable[Story | None], as_logged: Story) -> Story:
@@ -497,11 +495,12 @@ def _held(own: Ran, trial: Trial) -> Iterator[Row]:
     same = np.zeros(policy.horizon, bool)
     same[:T] = (np.abs(trial.inputs[:T] - before) <= 1e-9).all(axis=1)
     unsent, changed = int(np.argmin(same)), np.flatnonzero(~same[:T])
+    lost = float(same[:T].mean())
     if unsent > LATEST:
         story = _passed("run.unsent", own, steps=unsent)
-    elif len(changed) >= STEPS_TO_JUDGE and same.mean() > UNLIKE:
+    elif len(changed) >= STEPS_TO_JUDGE and lost > UNLIKE:
         every, dt = 1e3 * policy.dt * float(np.median(np.diff(changed))), 1e3 * policy.dt
-        story = _passed("run.skipped", own, lost=float(same.mean()), every=every, dt=dt)
+        story = _passed("run.skipped", own, lost=lost, every=every, dt=dt)
     else:
         return
     shape = (policy.horizon, m, n + sum(policy.depths))

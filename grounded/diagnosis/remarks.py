@@ -18,7 +18,6 @@ from grounded.diagnosis.error_report import RulerRow, errors, excess, lost_most,
 from grounded.diagnosis.levels import SURE
 from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.diagnosis.validation.claims import Claims
-from grounded.effects import ParamFamily
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 from grounded.trial import Trial
@@ -172,7 +171,7 @@ def next_step(
         trials: those that were diagnosed.
         adopted: adopted effects, whose values are parameters of the model.
     """
-    names, effects = claims.names, claims.best.hypothesis.effects
+    names = claims.names
     if d.no_cause:
         return found("gap.next.record")
     if d.changed:
@@ -194,8 +193,7 @@ def next_step(
         return doubt
     if turned:
         return found("gap.next.flip", input=turned[0].partition(":")[2])
-    own = all(isinstance(effect.family, ParamFamily) for effect in effects) and not adopted
-    return found("gap.next.adopt", own="yes" if own else "no", left=bool(d.leftover))
+    return found("gap.next.adopt", left=bool(d.leftover))
 
 
 def _look(d: Diagnosis, off: str, trials: Sequence[Trial]) -> Finding:

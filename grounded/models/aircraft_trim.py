@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import root
 
 from grounded.checks import known, wrong
 from grounded.frozen import Array, readonly
@@ -50,6 +49,8 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
     Raises:
         GroundedError: if the model is not an aircraft, or a condition has no trim.
     """
+    from scipy.optimize import root  # a fifth of a second
+
     speed, turn_rate = np.broadcast_arrays(np.atleast_1d(speed), np.atleast_1d(turn_rate))
     names = model.state_names
     known("state", [*FREE, "north", "east", "altitude", "psi"], names, f"model '{model.name}'")

@@ -411,7 +411,7 @@ def direction(
         measured: number of leading states that the robot measures; None for all of the task's.
             Gains on the memory of an adopted effect are replaced by gains on those
             (`measured_gains`). Gains on the memory of a corrected model are dropped
-            (`feedback.margin` checks the effect).
+            (`feedback.steadied` checks the effect).
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent

@@ -52,7 +52,7 @@ def test_output_is_printable_and_json_is_escaped(capsys: pytest.CaptureFixture[s
     assert "".join(capsys.readouterr().out.split("\n")).isprintable()
     show_json({EVIL: ["\ud800", "größe 🤖"]})
     text = capsys.readouterr().out
-    assert "".join(text.split("\n")).isprintable() and "größe 🤖" in json.loads(text)[EVIL]
+    assert "".join(text.split("\n")).isprintable()
     assert json.loads(text) == {EVIL: ["\ud800", "größe 🤖"]}
     assert table([("a\nnext: rm", "1")], ("x", "y")).count("\n") == 1
 
@@ -200,7 +200,7 @@ def test_an_interrupt_at_any_moment_leaves_no_traceback(folder: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("verb", "after"), [("diagnose", 1.5), ("diagnose", 3.0), ("fit", 1.5)])
 def test_an_interrupt_ends_a_long_computation_soon(verb: str, after: float, car: Path) -> None:
-    psutil = pytest.importorskip("psutil", reason="not needed on Linux")
+    psutil = pytest.importorskip("psutil", reason="needs psutil")
     child = subprocess.Popen(
         [*COMMAND, "-C", str(car), verb],
         stdout=subprocess.DEVNULL,

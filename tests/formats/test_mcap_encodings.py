@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from facts import holding
 from grounded_trials.formats.bad import BadMessage, BadPath, BadSchema
@@ -16,7 +17,6 @@ from grounded_trials.formats.mcap_records import Channel, Messages, Schema
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import decoder_of
 from grounded_trials.formats.path_walk import evaluate
-from path_reference import follow
 
 LINE = "=" * 80 + "\n"
 
@@ -205,9 +205,14 @@ def test_json() -> None:
         {"b": {}},
     ]
     messages = [json.dumps(o).encode() for o in objects]
-    for text in ("/t.a", "/t.b.c[0]", "/t.b.c[-2]", '/t.l[:]{n=="y"}.v', "/t.l[:]{v>3}.v"):
-        mine = found(messages, "json", text)
-        assert mine == [follow(o, parse_path(text)) for o in objects], text
+    wanted = {
+        "/t.a": [[1.0], [1.0], []],
+        "/t.b.c[0]": [[1.5], [], []],
+        "/t.b.c[-2]": [[2.0], [], []],
+        '/t.l[:]{n=="y"}.v': [[4.0], [], []],
+        "/t.l[:]{v>3}.v": [[4.0], [], []],
+    }
+    assert {text: found(messages, "json", text) for text in wanted} == wanted
     ((value,), *_) = found(messages, "json", "/t.b.c[2]")
     assert np.isnan(value)
     assert found([b'{"v": {"x": 3, "y": 4}}'], "json", "/t.v.@norm") == [[5]]
@@ -226,12 +231,11 @@ def test_quaternions_and_vectors() -> None:
     numbers = rng.normal(size=(50, 6))
     numbers[0, :4] = 0
     messages = [b"\0\1\0\0" + row.tobytes() for row in numbers]
-    objects = [{"q": dict(zip("xyzw", row[:4], strict=True)), "l": row[4:]} for row in numbers]
-    for path in ("/t.q.@rpy.roll", "/t.q.@rpy.pitch", "/t.q.@rpy.yaw"):
-        mine = np.ravel(found(messages, "cdr", path, text))
+    angles = Rotation.from_quat(numbers[1:, :4]).as_euler("ZYX").T
+    for name, wanted in zip(("yaw", "pitch", "roll"), angles, strict=True):
+        mine = np.ravel(found(messages, "cdr", f"/t.q.@rpy.{name}", text))
         assert np.isnan(mine[0])
-        wanted = [follow(o, parse_path(path))[0] for o in objects[1:]]
-        np.testing.assert_allclose(mine[1:], wanted, atol=1e-12)
+        np.testing.assert_allclose(mine[1:], wanted, atol=1e-9)
     lengths = np.ravel(found(messages, "cdr", "/t.l.@norm", text))
     np.testing.assert_allclose(lengths, np.hypot(*numbers[:, 4:].T))
 
@@ -257,3 +261,24 @@ def test_paths_that_do_not_fit_name_what_would(path: str, says: str) -> None:
     message = b"\0\1\0\0" + struct.pack("<dI1s3xI4xdd", 1, 1, b"\0", 1, 2, 3)
     with pytest.raises(BadPath, match=says):
         found([message], "cdr", path, text)
+
+
+@pytest.mark.parametrize(
+    ("value", "path"),
+    [
+        ({"l": [{"a": {}, "v": 1}]}, "/t.l[:]{a>1}.v"),
+        ({"q": {"x": "a", "y": 0, "z": 0, "w": 1}}, "/t.q.@rpy.yaw"),
+        ({"q": ["a", 0, 0, 1]}, "/t.q.@rpy.yaw"),
+    ],
+)
+def test_what_is_no_number_is_refused_wherever_a_path_needs_one(value: Any, path: str) -> None:
+    with pytest.raises(BadPath):
+        found([json.dumps(value).encode()], "json", path)
+
+
+@pytest.mark.parametrize("path", ["/t.q.@rpy.yaw", "/t.v.@norm"])
+def test_one_null_among_messages_is_a_missing_sample(path: str) -> None:
+    whole = {"q": {"x": 0, "y": 0, "z": 0, "w": 1}, "v": [3, 4]}
+    messages = [json.dumps(one).encode() for one in (whole, {"q": None, "v": None})]
+    first, second = np.ravel(found(messages, "json", path))
+    assert first == (5.0 if "norm" in path else 0.0) and np.isnan(second)

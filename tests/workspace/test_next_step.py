@@ -368,7 +368,6 @@ def test_a_late_sensor_is_adopted_with_the_physics(w, finding, effect, named):
     diagnosed(w.folder, preflight=[finding])
     done = w.adopt("viscous_friction:v", *[effect["name"]] * named)
     assert done.effects[-1] == effect and done.params == {"mass": 1.4}
-    assert "model.beside" not in [one.code for one in done.findings]
     assert done.along == (() if named else (effect["name"],))
     assert any(name.startswith("v_true") for name in w.planner.plan.model.state_names)
     assert following(w.folder) == "diagnose"

@@ -47,9 +47,9 @@ def columns() -> int:
     return min(max(shutil.get_terminal_size((WIDE, 24)).columns, NARROW), WIDE)
 
 
-def count(number: int, word: str, many: str = "") -> str:
-    """Return `1 trial`, `2 trials`; `many` is an irregular plural."""
-    return f"{number} {word if number == 1 else many or word + 's'}"
+def count(number: int, word: str) -> str:
+    """Return `1 trial`, `2 trials`."""
+    return f"{number} {word if number == 1 else word + 's'}"
 
 
 def ranges(names: Sequence[str]) -> str:

@@ -56,14 +56,14 @@ def command(
             return code
 
         functools.update_wrapper(call, declared)  # its help and its parameters
-        made = click.command(name, cls=click.Command)(call)
+        one = click.command(name, cls=click.Command)(call)
         if workspace:
-            in_workspace(made)
+            in_workspace(one)
         if json:
             text = "Print one JSON document."
-            made.params.append(click.Option(["--json", "json_"], is_flag=True, help=text))
-        group.add_command(made)
-        return made
+            one.params.append(click.Option(["--json", "json_"], is_flag=True, help=text))
+        group.add_command(one)
+        return one
 
     return made
 

@@ -48,17 +48,21 @@ from grounded.effects import (
 from grounded.frozen import Array
 from grounded.model import Model
 
-NEARLY = 0.75  # share of an effect's gain from which a look-alike is named
+NEARLY = 0.75  # share of an effect's gain from which a look-alike is fitted
 IDENTICAL = 1e-6  # fraction of a slope's power by which two equivalent effects may differ
-MOST_LOOKALIKES = 3  # most look-alikes named per effect
+MOST_LOOKALIKES = 3  # most look-alikes fitted per effect
 
 
 class Likeness(NamedTuple):
-    """A candidate that gains a share of what an effect gains; 1: no log tells them apart."""
+    """A candidate that gains nearly what an effect gains.
+
+    Attributes:
+        effect: the name of the effect.
+        like: that of the candidate.
+    """
 
     effect: str
     like: str
-    share: float
 
 
 def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
@@ -86,7 +90,7 @@ def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
         for share, look in near:
             if not (share > NEARLY and look.values):
                 continue
-            found.append(Likeness(effect.name, look.effect.name, min(share, 1 / share)))
+            found.append(Likeness(effect.name, look.effect.name))
             names = tuple(sorted((*rest.names, look.effect.name)))
             known = search.fits.get((best.noise.structure, h.spread, names))
             alike = any(one_friction(look.effect, other) for other in rest.effects)
@@ -231,7 +235,7 @@ def one_clock(
         side, other = (inputs, states) if effect.family.name == "delay" else (states, inputs)
         if {*effect.site.targets} == {*side} and other:
             like = f"{FAMILIES[effect.family.name]}:{'+'.join(other)}"
-            found.append(Likeness(effect.name, like, 1.0))
+            found.append(Likeness(effect.name, like))
     return tuple(found)
 
 

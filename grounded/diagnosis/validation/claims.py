@@ -78,14 +78,12 @@ class Claims:
         self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
         clock = one_clock(self.data.model, late, ruler.names, excitation(self.data).still)
-        alike = () if known.no_cause else (*clock, *self.alike)
-        self.same = [(one.effect, one.like) for one in alike if one.share == 1.0]
+        self.same = [] if known.no_cause else [(one.effect, one.like) for one in clock]
 
     def _known(self, off: Sequence[Blame]) -> tuple[Blame, ...]:
         """Return the parameters that are off by as much as trials agree on, if one clearly is.
 
-        Evidence takes the model for right. Of an aircraft, whose trials disagree by more, twelve
-        parameters were named that are off by no more than their standard deviations.
+        Evidence takes the model for right: trials may disagree by more than it says.
         """
         known, model = self.parameters() if off else {}, self.data.model
         sizes = dict[int, float]()

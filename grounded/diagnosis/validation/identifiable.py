@@ -105,8 +105,7 @@ def identified(
     If a calibrated value states a larger standard deviation than the information, it is used.
 
     Parameters that are not identifiable one by one may be so together, if all others are as
-    calibrated: a boat's masses, drags and thrust are known but for one factor of all, and without
-    the thrust the others were worse than nothing.
+    calibrated.
 
     Args:
         predictor: evaluates hypotheses, with all uncertain parameters free.
@@ -159,8 +158,7 @@ def identified(
         alone = _verdict(share)
         lost = alone == "not identifiable"
         together = _verdict(float(precision[i, i] ** -0.5)) != "not identifiable"
-        also = (together and lost and name in known) or name in joint
-        also = also and (held_out or not lost)
+        also = (name in joint or (together and lost and name in known)) and (held_out or not lost)
         rows.append(Identifiable(name, alone, float(priors[i]), share, given, also))
     return Identified(tuple(rows), tuple(found), wide)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -212,6 +213,7 @@ class Excitation:
     memory: frozenset[str]
 
 
+@lru_cache(maxsize=1)
 def excitation(data: Data) -> Excitation:
     """Return what moved in the trials."""
     model = data.model

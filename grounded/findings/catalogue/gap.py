@@ -94,7 +94,7 @@ ENTRIES: dict[str, Entry] = {
         "note",
         "[[{most:cause} {most:is/are} named, as many as were looked for, and more is left]]"
         "[[interrupted? interrupted while it looked for one more effect]]",
-        "adopt these and diagnose again, or allow more with --max-effects",
+        "adopt these and diagnose again[[most?, or allow more with --max-effects]]",
     ),
     "sign": Entry(
         "warn",
@@ -120,8 +120,7 @@ ENTRIES: dict[str, Entry] = {
     ),
     "next.adopt": Entry(
         "note",
-        "no trial is needed: {own:yes=fit the model's parameters,no=adopt the claimed effects}"
-        "[[left?; a diagnosis after it may tell more]]",
+        "no trial is needed: adopt the claimed causes[[left?; a diagnosis after it may tell more]]",
     ),
     "next.doubt": Entry(
         "note",

@@ -177,7 +177,7 @@ ENTRIES: dict[str, Entry] = {
     "workers": Entry(
         "refuse",
         "{lost} of {total:job} lost their worker ({why})",
-        "run the study again with fewer --jobs: finished jobs are kept",
+        "run the study again with fewer --jobs",
     ),
     "viewer": Entry(
         "refuse",

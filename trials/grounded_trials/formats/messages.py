@@ -21,7 +21,6 @@ from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema
 from grounded_trials.formats.protobuf import message_class, spelled, unspelled
 
 Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 Floats = NDArray[np.float64]
 
 PIECE = 2**20  # [bytes] of messages decoded at once, at least one: objects take much memory

@@ -163,7 +163,8 @@ def _passes(values: Values, step: Filter) -> list[bool]:
     rows, inner = _walk([*range(len(values))], values, [Field(name) for name in step.path])
     for row, value in zip(rows, inner, strict=True):
         value = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
-        if isinstance(value, str) != isinstance(step.value, str):
+        known = value is None or isinstance(value, str) or _is_number(value)
+        if not known or isinstance(value, str) != isinstance(step.value, str):
             expected, at = type_of(step.value), ".".join(step.path)
             raise BadPath("path", at=at, expected=expected, found=_kind(value))
         passes[row] = value is not None and bool(_COMPARE[step.operator](value, step.value))
@@ -197,13 +198,14 @@ def _stamped(part: Decoded, steps: Sequence[Step]) -> tuple[int, tuple[str, ...]
 
 def _stamp_in(value: Any) -> tuple[str, ...]:
     """Return the names that lead from an object to its time stamp, () if it has none."""
-    for names in STAMPS:
-        inner = value
-        for name in names:
-            inner = fields_of([inner], name)[0] if name in names_in(inner) else None
-        if is_time(inner):
-            return names
-    return ()
+    return next((names for names in STAMPS if is_time(_inside(value, names))), ())
+
+
+def _inside(value: Any, names: Sequence[str]) -> Any:
+    """Return what names lead to in an object, None if one of them is not there."""
+    for name in names:
+        value = fields_of([value], name)[0] if name in names_in(value) else None
+    return value
 
 
 def is_time(value: Any) -> bool:
@@ -271,19 +273,29 @@ def _part(values: Values, *names: str) -> Floats:
     found: Values = [np.nan] * len(values)
     rows, inner = _walk([*range(len(values))], values, [Field(name) for name in names])
     for row, value in zip(rows, inner, strict=True):
-        found[row] = np.nan if value is None else value
-    return np.array(found, dtype=np.float64)
+        found[row] = value
+    return _column(found)
+
+
+def _column(values: Values) -> Floats:
+    """Return numbers of objects, (N,), or of a table, (1, N)."""
+    of_table = any(isinstance(one, np.ndarray) for one in values)
+    return np.array(values, dtype=np.float64) if of_table else _numbers(values, is_table=False)
 
 
 def _turn(values: Values, *names: str) -> list[Floats]:
     """Return the quaternion (x, y, z, w) that names lead to, of length 1; NaN for zero."""
     turns = _walk([0] * len(values), values, [Field(name) for name in names])[1]
-    if all(is_list(one) and len(one) == 4 for one in turns):
-        quaternion = [np.array([one[i] for one in turns], np.float64).ravel() for i in (1, 2, 3, 0)]
-    elif all({*QUATERNION} <= {*names_in(one)} for one in turns):
+    known = [one for one in turns if one is not None]
+    if all(is_list(one) and len(one) == 4 for one in known):
+        quaternion = [
+            _column([None if one is None else one[i] for one in turns]).ravel()
+            for i in (1, 2, 3, 0)
+        ]
+    elif all({*QUATERNION} <= {*names_in(one)} for one in known):
         quaternion = [_part(turns, name).ravel() for name in QUATERNION]
     else:
-        raise BadPath("path", at="@rpy", expected="x, y, z, w", found=_kind(turns[0]))
+        raise BadPath("path", at="@rpy", expected="x, y, z, w", found=_kind(known[0]))
     with np.errstate(invalid="ignore", divide="ignore"):
         norm = np.sqrt(sum(q**2 for q in quaternion))
         return [q / norm for q in quaternion]
@@ -316,22 +328,19 @@ def _in_world(values: Values, axis: int) -> Floats:
 
 def _is_odometry(value: Any) -> bool:
     """Check whether an object has a pose and, in the robot's own axes, a velocity."""
-    for names, parts in ((TURNED, QUATERNION), (MOVING, AXES)):
-        inner = value
-        for name in names:
-            inner = fields_of([inner], name)[0] if name in names_in(inner) else None
-        if not {*parts} <= {*names_in(inner)}:
-            return False
-    return True
+    parts = ((TURNED, QUATERNION), (MOVING, AXES))
+    return all({*some} <= {*names_in(_inside(value, names))} for names, some in parts)
 
 
 def _norm(value: Any) -> Any:
     """Return the length of a vector: a list of numbers, or an object's; of a table (N,)."""
+    if value is None:
+        return np.nan
     parts = value if is_list(value) else [fields_of([value], n)[0] for n in names_in(value)]
     parts = [one for one in parts if _is_number(one) or isinstance(one, np.ndarray)]
     if not parts:
         raise BadPath("path", at="@norm", expected="numbers", found=_kind(value))
-    return np.sqrt(sum(np.asarray(one, np.float64) ** 2 for one in parts))
+    return np.sqrt(sum(_column([one])[0] ** 2 for one in parts))
 
 
 FIELD_LIMIT = 200  # paths listed per topic

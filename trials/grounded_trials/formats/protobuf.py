@@ -121,7 +121,7 @@ def uniform_doubles(
     ]
 
 
-_OWN_FIELD = re.compile(rb"\n[\x01-\x7f]([!-~]+)\x18.{1,2} ([\x01\x03])\(\x01", re.DOTALL)
+_OWN_FIELD = re.compile(rb"\n[\x01-\x7f]([!-~\x80-\xff]+)\x18.{1,2} ([\x01\x03])\(\x01", re.DOTALL)
 
 
 def numbers_in(schema: Schema) -> dict[str, tuple[int, bool]]:
@@ -133,7 +133,8 @@ def numbers_in(schema: Schema) -> dict[str, tuple[int, bool]]:
         BadSchema: if the definition can't be used.
     """
     own = _OWN_FIELD.findall(schema.data)
-    names, repeated = [name.decode() for name, _ in own], bool(own) and own[0][1] == b"\3"
+    names = [name.decode("utf-8", "replace") for name, _ in own]
+    repeated = bool(own) and own[0][1] == b"\3"
     written = file_descriptor_set(schema.name.removeprefix("grounded."), names, repeated=repeated)
     if written == schema.data and schema.name.startswith("grounded."):
         return {name: (i, repeated) for i, name in enumerate(names, start=1)}

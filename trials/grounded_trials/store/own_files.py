@@ -160,6 +160,8 @@ class OwnFile:
         try:
             decoder = decoder_of(*self.types[topic])
             objects = [o for b in batches for part in decoder.parts(b) for o in part.objects]
+        except BadSchema as error:
+            raise unreadable(f"{self.name}: {topic}", error) from None
         except BadMessage as error:
             raise DamagedFile(self.name, 0, "record", f"{topic}", str(error)) from None
         found = []

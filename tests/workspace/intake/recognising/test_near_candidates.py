@@ -180,15 +180,6 @@ def test_the_robot_ran_an_old_candidate_on_samples_of_its_own(ladder, tmp_path, 
     assert seen.own.left > 2 * acted_on(*at_start(w, log, by_alpha[ran])).left
 
 
-def test_how_old_the_samples_were_is_found_and_what_that_costs(ladder, tmp_path):
-    """A pose 6.8 ms old made a car lead by 12 mm, of 15: allowed for, but told nowhere."""
-    w, by_alpha = ladder
-    made = by_alpha[1]
-    log, policy, begins = at_start(w, drive(tmp_path / "a.mcap", w, made, 1), made)
-    old = acted_on(log, policy, begins).old  # 12 and 4 ms, and half of the 20 ms between samples
-    assert old == pytest.approx([0.022, 0.014], abs=0.004)
-
-
 def sender_of_log(w, path, said):
     """Who sent a log's commands, of all candidates of the workspace."""
     log, _, _ = at_start(w, path, said)

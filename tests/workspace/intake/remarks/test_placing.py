@@ -40,7 +40,7 @@ def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, mo
     for off in (-0.13, 0.11):
         set_aside(w, "discard", [placed(w, tmp_path, ran, off).trial], "")
         w.forget()
-    rms, runs = placing(w)
+    rms, runs = placing(w, w.read())
     assert runs == 3 and rms[0] == pytest.approx(1.4826 * 0.13)
     found = placed(w, tmp_path, ran, -0.14)
     (told,) = of_code(found, "run.start*")
@@ -69,4 +69,4 @@ def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, 
         last = placed(w, tmp_path, ran, off).trial
     set_aside(w, "discard", [last], "")
     w.forget()
-    assert placing(w)[0][0] == pytest.approx(1.4826 * 0.01)
+    assert placing(w, w.read())[0][0] == pytest.approx(1.4826 * 0.01)

@@ -179,7 +179,7 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     notes += [one for one in (lacks, now.doubt if unsure else None) if one]
     if candidate is None:
         return _ended(workspace, proposal, status, notes, asked)
-    return _told(workspace, proposal, status, notes, asked or to_run(workspace, candidate.id))
+    return _told(workspace, proposal, notes, asked or to_run(workspace, candidate.id))
 
 
 def _ended(
@@ -210,7 +210,6 @@ def _ended(
 def _told(
     workspace: Folder,
     proposal: Proposal,
-    status: Status,
     notes: Sequence[Finding],
     then: NextCommand,
 ) -> Proposed:

@@ -470,7 +470,6 @@ class ActedOn:
     off: Array  # (T,) rms over inputs, in units of their size; NaN if all are at their limits
     asked: Array  # (T, m) what the policy sends
     size: Array  # (m,) the largest value of each input
-    old: Array  # (n,) mean age of the samples of each state when commands were sent [s]
 
     @cached_property
     def told(self) -> Array:
@@ -533,14 +532,14 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
         return mean
 
     if policy.gain is None:
-        found, old = np.zeros((1, T, len(policy.state_names))), np.full(len(policy.state_names), 0)
+        found = np.zeros((1, T, len(policy.state_names)))
     else:
         tried = [samples.best(scores, held) for held in (True, False)]
-        found, old = min(tried, key=lambda one: scores(one[0])[0])
+        found = min(tried, key=lambda one: scores(one)[0])
     u = asked(found)[0]
     free = ((u > policy.low) & (u < policy.high)) | ((sent > policy.low) & (sent < policy.high))
     off = np.sqrt((((u - sent) / size) ** 2).mean(axis=1))
-    return ActedOn(np.where(free.any(axis=1), off, np.nan), u, size, old)
+    return ActedOn(np.where(free.any(axis=1), off, np.nan), u, size)
 
 
 @dataclass(frozen=True, eq=False)
@@ -548,7 +547,6 @@ class _Samples:
     """The samples of a log's states around the times at which commands were sent."""
 
     states: tuple[Samples, ...]
-    wrapped: tuple[bool, ...]  # whether a state is an angle
     guessed: tuple[bool, ...]  # whether a state was estimated by the smoother, not logged
     topics: tuple[tuple[int, ...], ...]  # states with the same time stamps
     at: Ints  # (T,) when commands were sent [ns]
@@ -566,34 +564,22 @@ class _Samples:
         finest = max(min(one.interval for one in states) / AGES_BETWEEN, OLDEST * log.dt / AGES)
         return cls(
             states,
-            tuple(n in log.angles for n in names),
             tuple(n not in log.logged for n in names),
             tuple(tuple(some) for some in together.values()),
             _sent_at(sent, begin, log.dt, steps),
             np.arange(-2 * finest, OLDEST * log.dt, finest),
         )
 
-    def best(self, scores: Callable[[Array], Array], held: bool) -> tuple[Array, Array]:
-        """Return the states at the ages that fit best, (1, T, n), and their mean ages [s], (n,)."""
+    def best(self, scores: Callable[[Array], Array], held: bool) -> Array:
+        """Return the states at the ages that fit best, (1, T, n)."""
         first = np.stack([self._aged(i, self.ages, held) for i in range(len(self.states))], axis=2)
-        k = int(np.argmin(scores(first)))
-        found, chosen = first[[k]], np.full(len(self.states), k)
+        found = first[[int(np.argmin(scores(first)))]]
         for _ in range(ROUNDS if len(self.topics) > 1 else 0):
             for topic in self.topics:
                 tried = np.repeat(found, len(self.ages), axis=0)
                 tried[:, :, topic] = first[:, :, topic]
-                k = int(np.argmin(scores(tried)))
-                found, chosen[list(topic)] = tried[[k]], k
-        ages = [self._age(i, float(self.ages[k]), held) for i, k in enumerate(chosen)]
-        return found, np.array(ages)
-
-    def _age(self, i: int, age: float, held: bool) -> float:
-        """Return the mean age of what is held, or interpolated, of a state an `age` ago."""
-        one, at = self.states[i], self.at - round(age * 1e9)
-        if not held or self.guessed[i]:
-            return age
-        last = np.clip(np.searchsorted(one.t, at, "right") - 1, 0, len(one.t) - 1)
-        return float(np.mean(self.at - one.t[last])) * 1e-9
+                found = tried[[int(np.argmin(scores(tried)))]]
+        return found
 
     def _aged(self, i: int, ages: Array, held: bool) -> Array:
         """Return a state at all ages when each command was sent, (A, T)."""

@@ -1,4 +1,4 @@
-"""Tell how the robot's program ran its candidate: late, cut, on old samples, smoothed or swinging.
+"""Tell how the robot's program ran its candidate otherwise than planned, such as late.
 
 Commands that are some steps late in a log were sent late or logged late: commands and states alone
 do not tell which.

@@ -62,7 +62,8 @@ def gone_wrong(
         usual = max(abs(tried.promised), 1e-9)
     if others:  # what the best one cost, and what runs miss otherwise
         cost = min(abs(t.utility) for t in others)
-        usual = max(usual, cost, float(np.median([abs(t.promised - t.utility) for t in others])))
+        off = np.array([abs(t.promised - t.utility) for t in others])
+        usual = max(usual, cost, float(median(off)))
     if tried is None or not as_planned(tried.candidate, run):
         astray = missed > SIGN_ASKED_FROM * usual
         if turned := reversed_input(workspace.planner, run, astray=astray):

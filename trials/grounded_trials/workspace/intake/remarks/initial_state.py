@@ -13,13 +13,13 @@ import numpy as np
 
 from grounded.accounts.sent import STEPS_TO_JUDGE
 from grounded.findings import Finding, Quantity, found
-from grounded.frozen import Array
+from grounded.frozen import Array, median
 from grounded.search.difference import Repeats, worth_of_start
 from grounded.search.noise import sample_noise
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.candidates.search_state import standing_of
-from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.folder import Contents, Folder
 
 START_IS_OFF = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
 TOLD, SPOILT = 0.05, 0.5  # share of the run's cost by which the start changes it: told; too much
@@ -58,14 +58,15 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     cost = abs(task.utility(trial))
     if not np.isfinite(cost) or len(states) <= trial.finite_steps:
         cost = -own.predicted_utility
-    others = standing_of(workspace, workspace.read(), {trial.id})
+    contents = workspace.read()
+    others = standing_of(workspace, contents, {trial.id})
     scatter = float(np.nan_to_num(np.sqrt(Repeats(others.history).near(-cost).variance)))
     change = _changes(workspace, trial, off)
     if abs(change) <= max(scatter, TOLD * cost):
         return None
     # a run that is better than the best from either start counts
     lead = task.utility(trial) - others.incumbent.utility if others.incumbent else np.nan
-    (rms, runs), first = placing(workspace, but=trial.id), far[0]
+    (rms, runs), first = placing(workspace, contents, but=trial.id), far[0]
     usual = np.abs(off) <= START_IS_OFF * rms
     name, unit = list(task.model.states.items())[first]
     began, start, away = (Quantity(float(x[first]), unit) for x in (trial.began, task.start, off))
@@ -79,7 +80,7 @@ def begun_elsewhere(workspace: Folder, trial: Trial) -> Finding | None:
     return found("run.start", *names, **facts)
 
 
-def placing(workspace: Folder, but: str = "") -> tuple[Array, int]:
+def placing(workspace: Folder, contents: Contents, but: str = "") -> tuple[Array, int]:
     """Return how far the latest runs of a task began off its start (rms, n), and how many they are.
 
     A run that was discarded counts too, since the robot was placed before it. The rms is estimated
@@ -87,10 +88,11 @@ def placing(workspace: Folder, but: str = "") -> tuple[Array, int]:
 
     Args:
         workspace: the workspace with the runs.
+        contents: what is stored in it.
         but: id of a run that is left out, since it is judged by the others.
     """
     task, stored = workspace.task, (*workspace.trials(), *workspace.aside_trials())
-    own = {made.id for made in workspace.read().candidates}
+    own = {made.id for made in contents.candidates}
     runs = (
         one.trial
         for one in sorted(stored, key=lambda one: one.stored.number)
@@ -100,7 +102,7 @@ def placing(workspace: Folder, but: str = "") -> tuple[Array, int]:
     known = np.array([one for one in off if np.isfinite(one).all()][-LATEST:])
     if len(known) < FEWEST:
         return np.zeros(task.model.n), len(known)
-    return np.asarray(MEDIAN_TO_STD * np.median(np.abs(known), axis=0)), len(known)
+    return np.asarray(MEDIAN_TO_STD * median(np.abs(known))), len(known)
 
 
 def _inside(task: Task, states: Array) -> Array:
