@@ -277,8 +277,8 @@ def drawn(part: Part, colour: Colour, ghost: bool = False) -> Any:
 # the views of the viewer
 
 
-def space(findings: Findings, body: Body, contents: Sequence[str], name: str) -> Any:
-    """Return a view of some entities; y points up from above, z from the side.
+def camera(findings: Findings, body: Body) -> dict[str, Any]:
+    """Return where the views look from, and their grid; y points up from above, z from the side.
 
     The camera sees the target, the best and the first run; others may diverge.
     """
@@ -300,9 +300,12 @@ def space(findings: Findings, body: Body, contents: Sequence[str], name: str) ->
     )
     spacing = 10.0 ** np.floor(np.log10(extent / 2))
     grid = rrb.LineGrid3D(visible=True, spacing=spacing, color=(90, 90, 90, 60))
-    return rrb.Spatial3DView(
-        origin="/", contents=list(contents), name=name, eye_controls=eye, line_grid=grid
-    )
+    return {"eye_controls": eye, "line_grid": grid}
+
+
+def space(view: Mapping[str, Any], contents: Sequence[str], name: str) -> Any:
+    """Return a view of some entities from a `camera`."""
+    return rrb.Spatial3DView(origin="/", contents=list(contents), name=name, **view)
 
 
 def blueprint(findings: Findings, body: Body) -> Any:
@@ -320,14 +323,14 @@ def blueprint(findings: Findings, body: Body) -> Any:
     utilities = rrb.BarChartView(
         origin="/utilities", name="Utility by iteration", plot_legend=hidden
     )
-    words = rrb.TextDocumentView(origin="/summary", name="Summary")
+    words, view = rrb.TextDocumentView(origin="/summary", name="Summary"), camera(findings, body)
     below = rrb.Horizontal(utilities, words, column_shares=[1, 2])
-    left = rrb.Vertical(space(findings, body, ["/paths/**"], "Paths"), below, row_shares=[3, 2])
+    left = rrb.Vertical(space(view, ["/paths/**"], "Paths"), below, row_shares=[3, 2])
     first = [plot for name, most in FIRST.items() for plot in plots.get(name, ())[:most]]
     both = rrb.Horizontal(left, rrb.Grid(*first, grid_columns=2), column_shares=[1, 1])
     tabs: list[Any] = [rrb.Vertical(answer, both, name="Overview", row_shares=heights)]
     tabs += [rrb.Grid(*plots[one.name], name=one.title) for one in figures]
-    tabs.append(rrb.Tabs(*_trials(findings, body), name="By trial"))
+    tabs.append(rrb.Tabs(*_trials(findings, view), name="By trial"))
 
     # a workspace of logs alone opens at the logs, with the answer above them
     only_logs = bool(findings.logs) and not findings.runs
@@ -344,7 +347,7 @@ def blueprint(findings: Findings, body: Body) -> Any:
     )
 
 
-def _trials(findings: Findings, body: Body) -> list[Any]:
+def _trials(findings: Findings, view: Mapping[str, Any]) -> list[Any]:
     """Return a tab for each of the latest trials and logs."""
     shown = [
         (f"/trials/{run.trial.id}", f"{run.label}, utility {figure(run.utility)}", run.explained)
@@ -358,8 +361,8 @@ def _trials(findings: Findings, body: Body) -> list[Any]:
         names = SIGNALS | ({} if explained is None else {"explained": "bias as diagnosed"})
         contents = ["/paths/desired", f"{at}/path", f"{at}/predicted/**", f"{at}/body/**"]
         plots = [_plot(f"{at}/{key}", name) for key, name in names.items()]
-        view = space(findings, body, contents, title)
-        tabs.append(rrb.Horizontal(view, rrb.Vertical(*plots), name=at.split("/")[-1]))
+        path = space(view, contents, title)
+        tabs.append(rrb.Horizontal(path, rrb.Vertical(*plots), name=at.split("/")[-1]))
     return tabs
 
 
