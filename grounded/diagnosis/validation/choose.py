@@ -11,6 +11,8 @@ where its values were not fitted (`ruler`, by group of trials). The rule has fou
     3. Of the supported sets that the reference is not better than, the smallest is chosen: the
        one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
        (Piironen & Vehtari 2017).
+       A set that predicts worse than the model without effects, calibrated or not, is claimed with
+       calibrated parameters, or not at all if that predicts worse, too.
     4. Of those that are as small, the likeliest. Within NATS nats they tie: then a parameter comes
        before a mechanism, and that before what has no mechanism (`Option.order`).
 
@@ -109,16 +111,26 @@ class Rule:
             return Choice(likeliest, likeliest, 0.0, 0.0)
         by = sorted(self.options, key=self.gained, reverse=True)
         reference = next(option for option in by if not self.unsupported(option))
-        near = [option for option in by if not self.better(option, reference)]
-        for size in sorted({len(option.causes) for option in near}):
-            small = [o for o in near if len(o.causes) == size and not self.unsupported(o)]
-            if small:
-                break
-        nats = {option.causes: self.nats(none, option) for option in small}
-        tied = [option for option in small if nats[option.causes] > max(nats.values()) - NATS]
-        chosen = min(tied, key=lambda option: (option.order, -nats[option.causes]))
+        near = [o for o in by if not (self.better(o, reference) or self.unsupported(o))]
+        claims = [(option, claim) for option in near if (claim := self._claimed(option))]
+        least = min(len(option.causes) for option, _ in claims)
+        small = [pair for pair in claims if len(pair[0].causes) == least]
+        nats = {option.causes: self.nats(none, option) for option, _ in small}
+        tied = [pair for pair in small if nats[pair[0].causes] > max(nats.values()) - NATS]
+        _, chosen = min(tied, key=lambda pair: (pair[0].order, -nats[pair[0].causes]))
         apart = self.gain(chosen.errors, reference.errors)
         return Choice(chosen, reference, apart.mean, apart.paired[1])
+
+    def _claimed(self, option: Option) -> Option | None:
+        """Return a set, or its calibrated form, if it predicts no worse than no effects do."""
+        bare = [o for o in self.options if o.causes <= {CALIBRATION} and not self.unsupported(o)]
+        least = max(map(self.gained, bare)) - LEAST
+        calibrated = (o for o in self.options if o.causes == option.causes | {CALIBRATION})
+        for claim in (option, *calibrated):
+            effects_supported = {*self.unsupported(claim)} <= {CALIBRATION}
+            if effects_supported and (claim in bare or self.gained(claim) >= least):
+                return claim
+        return None
 
     def gained(self, option: Option) -> float:
         """Return the gain since the outset."""

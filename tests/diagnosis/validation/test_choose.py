@@ -50,7 +50,12 @@ DRAG, BIAS = option("drag", 80.0, 0.3), option("bias", 30.0, 0.8)
         ([NONE, DRAG, option("bias drag", 110.0, 0.1)], "drag"),  # the rest was never fitted
         ([NONE, DRAG, option("lag", 85.0, 0.301)], "lag"),  # as small and as good: the likelier
         ([NONE, DRAG, option("lag", 85.0, 0.5)], "drag"),  # likelier, and predicts worse
-        ([NONE, DRAG, option("calibration", 70.0, 0.2)], "drag"),  # of several parameters
+        # nothing is named that predicts worse than the calibrated model
+        ([NONE, DRAG, option("calibration", 70.0, 0.2)], "calibration"),
+        (
+            [NONE, DRAG, option("calibration", 70.0, 0.2), option("calibration drag", 82.0, 0.15)],
+            "calibration drag",
+        ),
         ([NONE, DRAG, option("calibration", 90.0, 0.2)], "calibration"),
         ([NONE, option("drag", 80.0, 0.3, order=1), option("mass", 78.0, 0.3)], "mass"),
         ([NONE, option("wave", 80.0, 0.3, order=2), option("drag", 78.0, 0.3, order=1)], "drag"),
