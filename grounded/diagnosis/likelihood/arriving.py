@@ -20,25 +20,29 @@ from grounded.frozen import Array
 Acting = Sequence[tuple[Effect, Mapping[str, float]]]
 
 
-def arriving(acting: Acting, data: Data, j: int) -> Array:
-    """Return input j (S, T) received in the trials in use, after all effects on it and all delays.
+def arriving(acting: Acting, data: Data, j: int, *, leads: bool) -> Array:
+    """Return input j received in the trials in use, after all effects on it and all delays.
 
     Effects on one input do not depend on the others, so each is computed and cached by itself.
+
+    Args:
+        acting: effects on inputs with their values, in the order in which they act.
+        data: the data.
+        j: which input.
+        leads: also return how much more of it arrives early in each step than late
+            (`MemoryFamily.lead`).
+
+    Returns:
+        (1, S, T), or (2, S, T) with the leads.
     """
     steps = _late(acting, data, j) / data.dt
     sent = _sent_on(acting, data, j, steps)
-    if not sent.lead.any():
-        return shifted(sent.mean, sent.held, steps) if steps > 0 else sent.mean
-    return shifted_within(sent, steps)[0]
-
-
-def leading(acting: Acting, data: Data, j: int) -> Array:
-    """Return how much more of input j arrives early in each step than late (`MemoryFamily.lead`).
-
-    Shape (S, T), of the trials in use.
-    """
-    steps = _late(acting, data, j) / data.dt
-    return shifted_within(_sent_on(acting, data, j, steps), steps)[1]
+    within = shifted_within(sent, steps) if leads or sent.lead.any() else ()
+    if sent.lead.any():
+        mean = within[0]
+    else:
+        mean = shifted(sent.mean, sent.held, steps) if steps > 0 else sent.mean
+    return np.stack([mean, *within[1:]][: 1 + leads])
 
 
 def within_steps(acting: Acting, data: Data) -> bool:

@@ -25,7 +25,6 @@ from grounded.diagnosis.likelihood.arriving import (
     Acting,
     arriving,
     delayed,
-    leading,
     memories_moved,
     within_steps,
 )
@@ -100,19 +99,21 @@ class Predictor(Shared):
         If they may change within a step, m more columns say by how much they lead
         (`MemoryFamily.lead`); single steps then add what that changes (`_within`).
         """
-        acting, each = self.acting(h), range(self.data.model.m)
-        found = [self._input(acting, j, "input", arriving) for j in each]
-        if self._led_by(acting):
-            found += [self._input(acting, j, "lead", leading) for j in each]
-        return np.stack(found, axis=-1)
+        acting, data = self.acting(h), self.data
+        leads = self._led_by(acting)
+        received = [self._input(acting, j, leads=leads) for j in range(data.model.m)]
+        return np.stack([one[k] for k in range(1 + leads) for one in received], axis=-1)
 
-    def _input(
-        self, acting: Acting, j: int, what: str, made: Callable[[Acting, Data, int], Array]
-    ) -> Array:
-        """Return one of `inputs`, (L, B); cached, since most effects act on few inputs."""
+    def _input(self, acting: Acting, j: int, *, leads: bool) -> Array:
+        """Return one of `inputs` (1 or 2, L, B); cached, since most effects act on few inputs."""
         name, data = self.data.model.input_names[j], self.data
         on_it = [one for one in acting if name in one[0].site.targets]
-        return self._kept(f"{what} {j}", on_it, lambda: data.runs_in_use(made(on_it, data, j)))
+
+        def make() -> Array:
+            whole = arriving(on_it, data, j, leads=leads)
+            return np.stack([data.runs_in_use(one) for one in whole])
+
+        return self._kept(f"input {j} {leads}", on_it, make)
 
     def received(self, h: Hypothesis, *, leads: bool = False) -> Array:
         """Return the received inputs of whole trials, (S, T_max, m); zero if no run is kept.
@@ -120,16 +121,17 @@ class Predictor(Shared):
         leads: add the m columns that `inputs` adds, if there are any.
         """
         acting, data = self.acting(h), self.data
-        makers = [arriving, leading] if leads and self._led_by(acting) else [arriving]
+        leads = leads and self._led_by(acting)
 
         def make() -> Array:
-            whole = np.zeros((*data.commands.shape[:2], len(makers) * data.model.m))
-            for k, made in enumerate(makers):
-                for j in range(data.model.m):
-                    whole[data.used, :, k * data.model.m + j] = made(acting, data, j)
+            m = data.model.m
+            whole = np.zeros((*data.commands.shape[:2], m * (1 + leads)))
+            for j in range(m):
+                own = arriving(acting, data, j, leads=leads)
+                whole[data.used, :, j::m] = np.moveaxis(own, 0, -1)
             return whole
 
-        return self._kept(f"trials {len(makers)}", acting, make)
+        return self._kept(f"trials {leads}", acting, make)
 
     def _led_by(self, acting: Acting) -> bool:
         """Check whether inputs may change within a step, and whether that matters."""
