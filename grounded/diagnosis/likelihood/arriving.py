@@ -37,12 +37,13 @@ def arriving(acting: Acting, data: Data, j: int, *, leads: bool) -> Array:
     """
     steps = _late(acting, data, j) / data.dt
     sent = _sent_on(acting, data, j, steps)
-    within = shifted_within(sent, steps) if leads or sent.lead.any() else ()
-    if sent.lead.any():
+    mean, led = sent.mean, sent.lead.any()
+    within = shifted_within(sent, steps) if leads or led else None
+    if within is not None and led:
         mean = within[0]
-    else:
-        mean = shifted(sent.mean, sent.held, steps) if steps > 0 else sent.mean
-    return np.stack([mean, *within[1:]][: 1 + leads])
+    elif steps > 0:
+        mean = shifted(sent.mean, sent.held, steps)
+    return np.stack([mean, within[1]] if leads and within is not None else [mean])
 
 
 def within_steps(acting: Acting, data: Data) -> bool:
