@@ -25,10 +25,9 @@ from grounded_trials.report.forecast import anchored
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
-from grounded_trials.workspace.candidates.proposing import undecided
+from grounded_trials.workspace.candidates.proposing import unanswered, undecided
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Contents, Folder
-from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
 from grounded_trials.workspace.last_diagnosis import (
     read_diagnosis,
     since_diagnosis,

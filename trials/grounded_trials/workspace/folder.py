@@ -13,7 +13,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -46,6 +46,7 @@ from grounded_trials.workspace.user_files.model_file import load_module, model_i
 from grounded_trials.workspace.user_files.task_file import build_task, read_target
 
 if TYPE_CHECKING:
+    from grounded.search.standing import Standing
     from grounded_trials.logs.log_table import LogMapping
 
 _ID = re.compile(r"c\d{4,}")
@@ -58,6 +59,8 @@ class Contents:
     trials: tuple[StoredTrial, ...]  # in order of arrival
     candidates: tuple[Candidate, ...]  # those of the search for this task, in order of proposal
     lost: tuple[Lost, ...]
+    # of the search, without some trials
+    standings: dict[frozenset[str], Standing] = field(init=False, default_factory=dict)
 
 
 def _named(one: Lost) -> Lost:
@@ -153,6 +156,11 @@ class Folder:
         return self._read_trials(None)
 
     @cached_property
+    def _contents(self) -> dict[frozenset[str], Contents]:
+        """What was read, by the names of the files."""
+        return {}
+
+    @cached_property
     def noted(self) -> Noted:
         """The notes of the workspace."""
         return noted(self.notes.read())
@@ -166,7 +174,7 @@ class Folder:
 
     def forget_trials(self) -> None:
         """Forget the trials that were read, so that they are read again when needed."""
-        for name in ("_trials", "noted"):
+        for name in ("_trials", "_contents", "noted"):
             vars(self).pop(name, None)
 
     def read(self, *, strict: bool = True) -> Contents:
@@ -181,9 +189,15 @@ class Folder:
             GroundedError: if the task can't be built; if strict, also for damaged files.
         """
         lost: list[Lost] | None = None if strict else []
+        names = self.names()
+        if strict and names in self._contents:
+            return self._contents[names]
         trials = self._trials if lost is None else self._read_trials(lost)
         candidates = tuple(self._read_candidates(trials, lost))
-        return Contents(trials, candidates, tuple(lost or ()))
+        found = Contents(trials, candidates, tuple(lost or ()))
+        if strict:
+            self._contents[names] = found
+        return found
 
     def trials(self) -> tuple[StoredTrial, ...]:
         """Return every stored trial that is not set aside, in order of arrival.

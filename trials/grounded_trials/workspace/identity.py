@@ -60,7 +60,6 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
 # of files of earlier versions
 _ABSENT = dict.fromkeys(("way", "slopes", "seen"), "") | {"predicted_gain": "nan", "damping": "1.0"}
 _ABSENT |= dict.fromkeys(("caution", "likely_off", "sample_age"), "0.0")
-DECODED = 16  # files whose candidates are kept: a command decodes the same bytes several times
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +153,7 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
     return found
 
 
-_DECODED: dict[tuple[str, str], tuple[Candidate, dict[str, str]]] = {}  # the latest, by hash
+_DECODED: dict[tuple[str, str], tuple[Candidate, dict[str, str]]] = {}  # by hash
 
 
 def sha256(data: bytes) -> str:
@@ -232,8 +231,6 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
 
 def _keep(data: bytes, candidate: Candidate, meta: dict[str, str]) -> None:
     _DECODED[sha256(data), candidate.id] = candidate, meta
-    while len(_DECODED) > DECODED:
-        del _DECODED[next(iter(_DECODED))]
 
 
 def _text(value: object) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -190,8 +190,6 @@ def _ended(
     asked: NextCommand | None,
 ) -> Proposed:
     """Return that there is nothing to run; who proposes goes on after a run that was doubted."""
-    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
-
     _, doubted = unanswered(workspace)
     if doubted is not None:  # no candidate is handed out to show that the user goes on
         digest = workspace.store.find(doubted.arguments[0]).digest
@@ -359,13 +357,48 @@ def _certainty(now: Standing) -> tuple[Finding, ...]:
 
 def status_in(workspace: Folder) -> Status:
     """Return where the search stands; it waits if its last trial should be discarded first."""
-    from grounded_trials.workspace.intake.remarks.gone_wrong import unanswered
-
     asked, then = unanswered(workspace)
     if then is None:
         return status_of(workspace, standing_in(workspace, ahead=True))
     now = undecided(standing_in(workspace), then.arguments[0])
     return replace(status_of(workspace, now, asked), then=then)
+
+
+def unanswered(workspace: Folder) -> tuple[tuple[Finding, ...], NextCommand | None]:
+    """Return why the last trial should be discarded, and the command for it.
+
+    Args:
+        workspace: the workspace with the trials.
+
+    Returns:
+        (), None if nothing is wrong with it, if it ran another policy of a candidate's name, or if
+        the user has decided.
+    """
+    last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
+    if last is None or "~" in last.trial.candidate or _decided(workspace, last):
+        return (), None
+    some = settle(one for one in _open(workspace, last) if one)
+    aside = tuple(one for one in some if one.weight is Weight.ASIDE)
+    return aside, NextCommand("discard", (last.stored.id,)) if aside else None
+
+
+def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding | None]:
+    """Yield what a stored trial shows that may be a reason to discard it."""
+    if last.stored.digest in workspace.noted.asked:
+        yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
+        return
+    from grounded_trials.workspace.intake.remarks.gone_wrong import shown_by  # slow
+
+    history = standing_in(workspace).history
+    tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)
+    yield from shown_by(workspace, last.measured, tried, history, own="source" not in last.meta)
+
+
+def _decided(workspace: Folder, last: StoredTrial) -> bool:
+    """Return whether a trial was restored, or a candidate handed out after it."""
+    noted, stored = workspace.noted, last.stored
+    after = max((int(name[1:].split("-")[0]) for name in noted.last if name), default=0)
+    return after >= stored.number or bool({stored.path.stem, stored.digest} & noted.kept)
 
 
 def undecided(now: Standing, trial: str) -> Standing:

@@ -61,9 +61,13 @@ def standing_in(
 def standing_of(workspace: Folder, contents: Contents, without: Collection[str] = ()) -> Standing:
     """Return the standing of the search by what a folder holds, without some trials."""
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
-    trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-    trials = [trial for trial in trials if trial.id not in without]
-    return standing(task, contents.candidates, trials, options, planner.fingerprint, planner)
+    if (key := frozenset(without)) not in contents.standings:
+        trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
+        trials = [trial for trial in trials if trial.id not in without]
+        contents.standings[key] = standing(
+            task, contents.candidates, trials, options, planner.fingerprint, planner
+        )
+    return contents.standings[key]
 
 
 def answered(workspace: Folder, now: Standing) -> Standing:

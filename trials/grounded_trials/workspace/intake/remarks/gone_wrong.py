@@ -9,8 +9,8 @@ ended. But a robot that crashes leaves its prediction or [safety] first. If it w
 prediction at the end as before, and was not about to leave [safety], the candidate should not count
 as failed: the next plan would shrink from it.
 
-`ingest` asks once, `status` again (`unanswered`), until the user has decided: the trial is
-discarded, or restored, or a candidate was handed out after it.
+`ingest` asks once, `status` again (`proposing.unanswered`), until the user has decided: the trial
+is discarded, or restored, or a candidate was handed out after it.
 """
 
 from __future__ import annotations
@@ -21,15 +21,13 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from grounded.accounts.sent import STEPS_TO_JUDGE, as_planned, like_predicted
-from grounded.errors import NextCommand
-from grounded.findings import Finding, Weight, found, settle
+from grounded.findings import Finding, Weight, found
 from grounded.frozen import median
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.run_motion import reversed_input, signs_of
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial
 from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
 from grounded_trials.workspace.intake.remarks.log_faults import log_faults
@@ -145,36 +143,6 @@ def as_before(task: Task, own: Candidate, run: Trial) -> bool:
     return bool(all(inside) and (end <= known).all())
 
 
-def unanswered(workspace: Folder) -> tuple[tuple[Finding, ...], NextCommand | None]:
-    """Return why the last trial should be discarded, and the command for it.
-
-    Args:
-        workspace: the workspace with the trials.
-
-    Returns:
-        (), None if nothing is wrong with it, if it ran another policy of a candidate's name, or if
-        the user has decided.
-    """
-    last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
-    if last is None or "~" in last.trial.candidate or _decided(workspace, last):
-        return (), None
-    some = settle(one for one in _open(workspace, last) if one)
-    aside = tuple(one for one in some if one.weight is Weight.ASIDE)
-    return aside, NextCommand("discard", (last.stored.id,)) if aside else None
-
-
-def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding | None]:
-    """Yield what a stored trial shows that may be a reason to discard it."""
-    from grounded_trials.workspace.candidates.search_state import standing_in
-
-    if last.stored.digest in workspace.noted.asked:
-        yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
-        return
-    history = standing_in(workspace).history
-    tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)
-    yield from shown_by(workspace, last.measured, tried, history, own="source" not in last.meta)
-
-
 def shown_by(
     workspace: Folder,
     trial: Trial,
@@ -202,10 +170,3 @@ def shown_by(
     yield begun_elsewhere(workspace, trial)
     yield gone_wrong(workspace, whole, tried, history)
     yield ended_early(workspace, trial, silent)
-
-
-def _decided(workspace: Folder, last: StoredTrial) -> bool:
-    """Return whether a trial was restored, or a candidate handed out after it."""
-    noted, stored = workspace.noted, last.stored
-    after = max((int(name[1:].split("-")[0]) for name in noted.last if name), default=0)
-    return after >= stored.number or bool({stored.path.stem, stored.digest} & noted.kept)
