@@ -287,6 +287,12 @@ class Model:
         return values
 
     @cached_property
+    def spreads(self) -> Array:
+        """Prior standard deviation of each parameter (k,), 0 for a constant."""
+        values: Array = readonly([param.spread for param in self.params.values()])
+        return values
+
+    @cached_property
     def angle_mask(self) -> Any:
         """Which states are angles, (n,) bool."""
         return readonly([name in self.angles for name in self.states], dtype=np.bool_)

@@ -32,6 +32,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from types import MappingProxyType
 from typing import Any
 
@@ -363,12 +364,12 @@ class Effect:
     site: Site
     quantities: tuple[Quantity, ...]
 
-    @property
+    @cached_property
     def name(self) -> str:
         """`family:target`."""
         return f"{self.family.name}:{self.site.joined}"
 
-    @property
+    @cached_property
     def free(self) -> tuple[Quantity, ...]:
         """The quantities that are estimated."""
         return tuple(q for q in self.quantities if not q.fixed)

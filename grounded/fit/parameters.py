@@ -23,7 +23,7 @@ from grounded.diagnosis.hypotheses.search import (
 )
 from grounded.diagnosis.likelihood.data import Data, entire
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import FARTHEST_MOVE, level
 from grounded.diagnosis.likelihood.linearise import thresholds
 from grounded.diagnosis.likelihood.noise import Structure
@@ -221,9 +221,7 @@ def _far_off(search: Alone, fit: Fitted) -> list[tuple[int, Array]]:
     for j in thresholds(search.predictor, fit):
         i = calibrated(data)[j - len(effects)]
         ends = np.array([*data.model.params.values()][i].reach) - data.model.values[i]
-        low, high = np.clip(
-            ends / param_scale(data.model)[i], -FARTHEST_MOVE, FARTHEST_MOVE
-        ).tolist()
+        low, high = np.clip(ends / data.model.spreads[i], -FARTHEST_MOVE, FARTHEST_MOVE).tolist()
         found.append((j, np.linspace(low, high, GRID)))
     return found
 
@@ -231,7 +229,7 @@ def _far_off(search: Alone, fit: Fitted) -> list[tuple[int, Array]]:
 def _at(fit: Fitted, data: Data, j: int, value: float) -> Hypothesis:
     """Return a fit's hypothesis with another value of unknown j."""
     h, which = fit.hypothesis, calibrated(data)
-    shift = np.zeros(0) if h.shift is None else h.shift[which] / param_scale(data.model)[which]
+    shift = np.zeros(0) if h.shift is None else h.shift[which] / data.model.spreads[which]
     now = np.concatenate([h.theta, shift])
     return moved(data, h, np.where(np.arange(len(now)) == j, value - now, 0.0))
 

@@ -27,7 +27,7 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.hypotheses.variations import LATE, tune, varied
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import Effect
 from grounded.effects.drive import motion_of, push
@@ -86,7 +86,7 @@ def _starts(search: HypothesisSearch, joints: Sequence[tuple[Effect, Effect]]) -
     """Return starts with little or much friction, free or exact parameters, a lag or none."""
     data = search.data
     bare, spreads = Hypothesis(), [0.0]
-    if param_scale(data.model).any():
+    if data.model.spreads.any():
         spreads.append(CRUDE)
     own = [
         1 / max(push(inertia.site.model, inertia.site.joined), 1e-12) for _, inertia in joints

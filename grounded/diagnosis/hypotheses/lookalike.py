@@ -33,7 +33,7 @@ from grounded.diagnosis.hypotheses.search import CRUDE, TO_THE_TOP, HypothesisSe
 from grounded.diagnosis.levels import NATS, ROUNDING
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
 from grounded.effects import (
@@ -145,7 +145,7 @@ def twins(predictor: Predictor, one: Effect, other: Effect, free: Sequence[int])
     y = rng.uniform(low, high, (SAMPLES, data.model.n))
     u = rng.uniform(least - apart, most + apart, (SAMPLES, data.model.m))
     size = np.where(high > low, high - low, 1.0)  # of a state that is not logged: any
-    scale, names = param_scale(data.model), data.model.param_names
+    scale, names = data.model.spreads, data.model.param_names
 
     def slope(effect: Effect) -> Array:
         (q,) = effect.free
@@ -196,7 +196,7 @@ def _rate(predictor: Predictor, h: Hypothesis, y: Array, u: Array) -> Array:
     Those of a simulator, which has no instantaneous rates, are means over a step.
     """
     given, names = u.copy(), predictor.data.model.input_names
-    for effect, values in predictor.acting(h):
+    for effect, values in h.acting:
         assert isinstance(effect.family, InputFamily)
         for name in effect.site.targets:
             j = names.index(name)
@@ -204,7 +204,7 @@ def _rate(predictor: Predictor, h: Hypothesis, y: Array, u: Array) -> Array:
     x = y - predictor.standing(h, y)
     dt = predictor.data.dt * (1.0 if simulated(predictor.data.model) else MOMENT)
     own = (predictor.step(x, given, predictor.params(h), dt) - x) / dt
-    rate = own + predictor.added_rate(rates_of(h), x, given, np.zeros(len(x)), predictor.named(own))
+    rate = own + predictor.added_rate(h.rates, x, given, np.zeros(len(x)), predictor.named(own))
     return rate + (predictor.standing(h, x + dt * rate) - predictor.standing(h, x)) / dt
 
 

@@ -19,7 +19,7 @@ from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delayed
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure, noise_guess
 from grounded.diagnosis.likelihood.polish import polished
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -195,7 +195,7 @@ class HypothesisSearch(FittedHypotheses):
         If a parameter moves by more than that, fit it with the full prior, too.
         """
         shift = np.zeros(self.data.model.system.k)
-        if fit.hypothesis.spread > 0 or not param_scale(self.data.model).any():
+        if fit.hypothesis.spread > 0 or not self.data.model.spreads.any():
             return []
         starts = [
             (replace(fit.hypothesis, spread=w, shift=shift), fit.noise, fit.track) for w in SPREADS
@@ -208,7 +208,7 @@ class HypothesisSearch(FittedHypotheses):
 
     def far(self, fit: Fitted) -> bool:
         """Check whether a parameter has moved by more than its prior standard deviation."""
-        h, unit = fit.hypothesis, param_scale(self.data.model)
+        h, unit = fit.hypothesis, self.data.model.spreads
         assert h.shift is not None
         return bool((np.abs(h.shift) > h.spread * unit).any())
 

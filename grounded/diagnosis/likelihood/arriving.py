@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from grounded.compile import Named
-from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.data import Data
 from grounded.effects import Effect, InputFamily, MemoryFamily
 from grounded.effects.memory import Sent, part_of, settled, shifted, shifted_within
@@ -48,9 +47,8 @@ def arriving(acting: Acting, data: Data, j: int, *, leads: bool) -> Array:
 
 def within_steps(acting: Acting, data: Data) -> bool:
     """Check whether an input may change within a step."""
-    parts = np.abs(data.latency / data.dt - np.round(data.latency / data.dt))
     moving = (e.family for e, _ in acting if isinstance(e.family, MemoryFamily))
-    return bool((parts > ROUNDING).any()) or any(f.transport or f.lead is not None for f in moving)
+    return data.late_within or any(f.transport or f.lead is not None for f in moving)
 
 
 def delayed(acting: Acting, data: Data) -> Array | None:

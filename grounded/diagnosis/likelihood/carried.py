@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, adds_to_steps, losses_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis, adds_to_steps
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
@@ -35,7 +35,7 @@ REPEATED_ABOVE = 0.1
 def stepper(predictor: Predictor, h: Hypothesis) -> Callable[[Array, Array, Array], Array]:
     """Return the step function of rollouts of a hypothesis: x (M, n), u (M, m), t (M,) -> x."""
     model, dt = predictor.data.model, predictor.data.dt
-    if losses_of(h) and simulated(model):
+    if h.losses and simulated(model):
         one = Carried(predictor.data, predictor._inputs)
         return lambda x, u, t: one.advance(h, x, u, t)
     p = predictor.params(h)
@@ -58,7 +58,7 @@ class Carried(Predictor):
 
     def moved(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Array:
         """Return the model's step with the joints' losses, without added or limited rates."""
-        pairs = losses_of(h)
+        pairs = h.losses
         if dt is not None or not pairs or moving(h, self.seen):
             return super().moved(h, x, u, dt)
         inputs, seen, p = self.data.model.input_names, self.seen, self.params(h)

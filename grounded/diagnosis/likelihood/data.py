@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from grounded.checks import refused, same_dt, same_names
+from grounded.diagnosis.levels import ROUNDING
 from grounded.diagnosis.likelihood.groups import Group, Signals, folds
 from grounded.diagnosis.likelihood.memories import memories, recalled
 from grounded.diagnosis.likelihood.simulated import simulated
@@ -174,6 +175,12 @@ class Data:
         """Indices of the steps of the runs (L, B) in flat values of the `used` trials."""
         trial, step = self._of_runs
         return np.searchsorted(self.used, trial) * self.commands.shape[1] + step
+
+    @cached_property
+    def late_within(self) -> bool:
+        """Whether the modelled latency lets an input change within a step."""
+        steps = self.latency / self.dt
+        return bool((np.abs(steps - np.round(steps)) > ROUNDING).any())
 
     def runs_in_use(self, per_step: Array) -> Array:
         """Cut per-step values of the `used` trials (S, T_max) into runs (L, B)."""

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
 
@@ -52,7 +52,7 @@ class Fitted:
         k = len(h.theta)
         if h.shift is not None and len(pull) > k:
             which = calibrated(data)
-            pull[k:] = self.prior[k:] * h.shift[which] / param_scale(data.model)[which]
+            pull[k:] = self.prior[k:] * h.shift[which] / data.model.spreads[which]
         return pull
 
     @property
@@ -70,7 +70,7 @@ def shift_precision(h: Hypothesis, count: int) -> Array:
 
 def calibrated(data: Data) -> Any:
     """Return the indices of the uncertain parameters, those with a scale, which may be shifted."""
-    return np.flatnonzero(param_scale(data.model) > 0)
+    return np.flatnonzero(data.model.spreads > 0)
 
 
 def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
@@ -81,7 +81,7 @@ def moved(data: Data, h: Hypothesis, delta: Array) -> Hypothesis:
         return other
     which = calibrated(data)
     shift = np.zeros(data.model.system.k) if h.shift is None else h.shift.copy()
-    shift[which] += delta[k:] * param_scale(data.model)[which]
+    shift[which] += delta[k:] * data.model.spreads[which]
     return replace(other, shift=shift)
 
 

@@ -17,16 +17,16 @@ from grounded.effects import (
     SensorDelayFamily,
     SensorFamily,
     SensorLagFamily,
+    acting_order,
 )
 from grounded.frozen import Array
-from grounded.model import Model
 
 
 @dataclass(frozen=True, eq=False)
 class Hypothesis:
     """Effects with their values, and shifts of the model's parameters (k,) with a prior.
 
-    `spread` is the prior standard deviation of every shift in units of `param_scale`, which the
+    `spread` is the prior standard deviation of every shift in units of `Model.spreads`, which the
     user gives; 0: the parameters are exact.
     """
 
@@ -35,7 +35,7 @@ class Hypothesis:
     shift: Array | None = None
     spread: float = 0.0
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """The effects' names."""
         return tuple(effect.name for effect in self.effects)
@@ -44,6 +44,30 @@ class Hypothesis:
     def pairs(self) -> list[tuple[Effect, Mapping[str, float]]]:
         """The effects, each with its values."""
         return list(zip(self.effects, self.values, strict=True))
+
+    @cached_property
+    def acting(self) -> list[tuple[Effect, Mapping[str, float]]]:
+        """The effects on inputs with their values, in the order in which they act."""
+        return [self.pairs[i] for i in acting_order([effect.family for effect in self.effects])]
+
+    @cached_property
+    def rates(self) -> list[tuple[Any, Mapping[str, float]]]:
+        """The effects that add rates (half before, half after a step), with their values."""
+        return [(e, v) for e, v in self._added if not e.family.parts]
+
+    @cached_property
+    def limits(self) -> list[tuple[Any, Mapping[str, float]]]:
+        """The effects that limit rates (applied in parts of a step), with their values."""
+        return [(e, v) for e, v in self._added if e.family.parts]
+
+    @cached_property
+    def losses(self) -> list[tuple[Any, Mapping[str, float]]]:
+        """The losses of joints, with their values."""
+        return [(e, v) for e, v in self.pairs if isinstance(e.family, LossFamily)]
+
+    @cached_property
+    def _added(self) -> list[tuple[Any, Mapping[str, float]]]:
+        return [(e, v) for e, v in self.pairs if isinstance(e.family, RateFamily)]
 
     @cached_property
     def theta(self) -> Array:
@@ -118,30 +142,10 @@ def by_row(hypotheses: Sequence[Hypothesis], which: Any) -> Hypothesis:
     return replace(first, values=tuple(values), shift=rows(np.stack(shifts)) if shifts else None)
 
 
-def param_scale(model: Model) -> Array:
-    """Return the prior standard deviation of each parameter (k,), 0 for a constant."""
-    return np.array([param.spread for param in model.params.values()], float)
-
-
-def rates_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """Return the effects that add rates (half before, half after a step), with their values."""
-    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and not e.family.parts]
-
-
-def limits_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """Return the effects that limit rates (applied in parts of a step), with their values."""
-    return [(e, v) for e, v in h.pairs if isinstance(e.family, RateFamily) and e.family.parts]
-
-
-def losses_of(h: Hypothesis) -> list[tuple[Any, Mapping[str, float]]]:
-    """Return the losses of joints, with their values."""
-    return [(e, v) for e, v in h.pairs if isinstance(e.family, LossFamily)]
-
-
 def adds_to_steps(h: Hypothesis) -> bool:
     """Check whether a hypothesis changes the model's steps other than by the inputs received."""
     medium = any(isinstance(e.family, MediumFamily) for e in h.effects)
-    return bool(rates_of(h) or limits_of(h) or losses_of(h) or medium)
+    return bool(h.rates or h.limits or h.losses or medium)
 
 
 def of_sensor(effect: Effect) -> bool:

@@ -25,7 +25,7 @@ import numpy as np
 from grounded.diagnosis.error_report import TIMES
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, leave_one_out, moved
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import gains_of, linearise, thresholds
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
@@ -166,7 +166,7 @@ def between_samples(h: Hypothesis, data: Data, count: int) -> Array:
     if not data.interpolated_s:
         return found
     found[[k for k, name in enumerate(free) if name in TIMES]] = data.interpolated_s
-    which, scale = calibrated(data), param_scale(data.model)
+    which, scale = calibrated(data), data.model.spreads
     for k, i in enumerate(which if count > len(free) else ()):
         param = list(data.model.params.values())[i]
         off = moved_by(data.interpolated_s, param.value, param.unit)

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.compile import System, system_of
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Effect, LossFamily
 from grounded.effects.drive import push, speed
 from grounded.effects.family import coupled
@@ -33,7 +33,7 @@ Remembering = list[tuple[Effect, Mapping[str, float], tuple[str, ...]]]
 
 def remembering(h: Hypothesis) -> Remembering:
     """Return the losses with a memory, with their values and the names of it."""
-    each = [(e, v, tuple(e.family.memory(e.site))) for e, v in losses_of(h)]
+    each = [(e, v, tuple(e.family.memory(e.site))) for e, v in h.losses]
     return [(e, v, names) for e, v, names in each if names]
 
 
@@ -49,7 +49,7 @@ def at(h: Hypothesis, z: Array) -> Hypothesis:
 def after(predictor: Predictor, h: Hypothesis, x: Array, reached: Array, u: Array) -> Array:
     """Return the memories (..., k) after a step from x to `reached` (..., n) under inputs u."""
     inputs, found = predictor.data.model.input_names, list[Array]()
-    weights = dict(zip((e.name for e, _ in losses_of(h)), _weights(predictor, h, x), strict=True))
+    weights = dict(zip((e.name for e, _ in h.losses), _weights(predictor, h, x), strict=True))
     for effect, c, names in remembering(h):
         ends = [speed(effect, predictor.named(end), weights[effect.name]) for end in (x, reached)]
         sent = u[..., inputs.index(coupled(effect.site)[0])]
@@ -68,7 +68,7 @@ def along(predictor: Predictor, h: Hypothesis, x: Array) -> Array:
     T = data.commands.shape[1]
     whole = states[begin + np.minimum(np.arange(T + 1), data.lengths[:, None])]  # (S, T + 1, n)
     sent, found = predictor.received(h), list[Array]()
-    weights = dict(zip((e.name for e, _ in losses_of(h)), _weights(predictor, h, x), strict=True))
+    weights = dict(zip((e.name for e, _ in h.losses), _weights(predictor, h, x), strict=True))
     for effect, c, names in own:
         w = speed(effect, predictor.named(whole), weights[effect.name])
         j = data.model.input_names.index(coupled(effect.site)[0])

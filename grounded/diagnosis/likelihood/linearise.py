@@ -43,9 +43,7 @@ from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
 from grounded.diagnosis.likelihood.hypothesis import (
     Hypothesis,
     adds_to_steps,
-    losses_of,
     of_sensor,
-    param_scale,
 )
 from grounded.diagnosis.likelihood.moving import moving
 from grounded.diagnosis.likelihood.noise import NoiseModel
@@ -121,7 +119,7 @@ def linearise(
     )
     for j, i in enumerate(calibrated(data) if h.spread else (), start=1 + len(h.theta)):
         if f_p is not None:
-            np.multiply(f_p[..., i], param_scale(model)[i], out=d[..., j])
+            np.multiply(f_p[..., i], model.spreads[i], out=d[..., j])
         else:
             d[..., j] = _by_parameter(predictor, h, x, u, after, i)
     _by_values(predictor, h, track, (after, ahead, shown, offset), (d, r))
@@ -202,7 +200,7 @@ def sensitivities_of(
 
     slopes = predictor.taken.at(take, *flat, p, True) if simulated(data.model) else take(*flat)
     f_x, f_u, f_p = (f.reshape(*x.shape, f.shape[-1]) for f in slopes)
-    if losses_of(h):
+    if h.losses:
         by_x, by_p = predictor.loss_slopes(h, x, u, f_x, f_p)
         f_x, f_p = f_x - f_u @ by_x, f_p - f_u @ by_p
     F = with_effects(predictor, h, x, u, f_x, after)
@@ -222,7 +220,7 @@ def step_jacobian(
         F = step_jacobian(predictor, medium.still, start, end)
         return logged_slopes(predictor, h, later @ F @ before)
     f_x, f_u = predictor.slopes(x, predictor.left(h, x, u)[0], predictor.params(h))
-    if losses_of(h):
+    if h.losses:
         f_x = f_x - f_u @ predictor.loss_slopes(h, x, u, f_x)[0]
     return with_effects(predictor, h, x, u, f_x, after)
 
@@ -381,16 +379,16 @@ def sensitivities(
     """
     f_x, f_u, f_p = model.system.sensitivities(x, u, p, dt)
     few = f_p[:SAMPLES_FIRST].any(axis=(0, 1))
-    flat = np.flatnonzero(~few & (param_scale(model) > 0))
+    flat = np.flatnonzero(~few & (model.spreads > 0))
     flat = flat[~f_p[:, :, flat].any(axis=(0, 1))] if len(flat) else flat
     for i in flat:
         for part in SECANTS:
             ends = []
             for sign in (-1, 1):
                 moved = p.copy()
-                moved[i] += sign * part * param_scale(model)[i]
+                moved[i] += sign * part * model.spreads[i]
                 ends.append(model.system.step(x, u, moved, dt))
-            f_p[:, :, i] = model.difference(ends[1], ends[0]) / (2 * part * param_scale(model)[i])
+            f_p[:, :, i] = model.difference(ends[1], ends[0]) / (2 * part * model.spreads[i])
             if f_p[:, :, i].any():
                 break
     return f_x, f_u, f_p

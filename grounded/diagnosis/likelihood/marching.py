@@ -80,7 +80,7 @@ def marched(
         return None
     led = u[..., m:].any(axis=(1, 2))
     u = u if led.any() else np.ascontiguousarray(u[..., :m])
-    parts = delayed(predictor.acting(h), data) if led.any() and predictor.divisible else None
+    parts = delayed(h.acting, data) if led.any() and predictor.divisible else None
     arrival = Arrival.of(parts, predictor.divisible) if led.any() else None
     acting = (e.name for e, _ in h.pairs if isinstance(e.family, LossFamily | RateFamily))
     key, given = (*acting, arrival), np.zeros(0) if parts is None else parts

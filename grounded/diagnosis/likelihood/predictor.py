@@ -35,10 +35,6 @@ from grounded.diagnosis.likelihood.hypothesis import (
     Hypothesis,
     adds_to_steps,
     by_row,
-    limits_of,
-    losses_of,
-    param_scale,
-    rates_of,
 )
 from grounded.diagnosis.likelihood.marching import March
 from grounded.diagnosis.likelihood.memories import recalled
@@ -50,7 +46,6 @@ from grounded.effects import (
     SensorDelayFamily,
     SensorFamily,
     SensorLagFamily,
-    acting_order,
 )
 from grounded.effects.drive import weights_at
 from grounded.effects.family import braked, coupled
@@ -85,7 +80,7 @@ class Predictor(Shared):
         model, scales = self.data.model, self.data.scales
         spreads = np.array([scales.spread(n) for n in model.state_names])
         peaks = np.array([scales.peak(n) for n in model.input_names])
-        return self._taken or Slopes((spreads, peaks, np.abs(model.values) + param_scale(model)))
+        return self._taken or Slopes((spreads, peaks, np.abs(model.values) + model.spreads))
 
     def following(self) -> Predictor:
         """Return a predictor whose caches follow one hypothesis' track, if a simulator; or self."""
@@ -99,10 +94,14 @@ class Predictor(Shared):
         If they may change within a step, m more columns say by how much they lead
         (`MemoryFamily.lead`); single steps then add what that changes (`_within`).
         """
-        acting, data = self.acting(h), self.data
+        acting, data = h.acting, self.data
         leads = self._led_by(acting)
-        received = [self._input(acting, j, leads=leads) for j in range(data.model.m)]
-        return np.stack([one[k] for k in range(1 + leads) for one in received], axis=-1)
+
+        def make() -> Array:
+            received = [self._input(acting, j, leads=leads) for j in range(data.model.m)]
+            return np.stack([one[k] for k in range(1 + leads) for one in received], axis=-1)
+
+        return self._kept("inputs", acting, make)
 
     def _input(self, acting: Acting, j: int, *, leads: bool) -> Array:
         """Return one of `inputs` (1 or 2, L, B); cached, since most effects act on few inputs."""
@@ -120,7 +119,7 @@ class Predictor(Shared):
 
         leads: add the m columns that `inputs` adds, if there are any.
         """
-        acting, data = self.acting(h), self.data
+        acting, data = h.acting, self.data
         leads = leads and self._led_by(acting)
 
         def make() -> Array:
@@ -153,9 +152,9 @@ class Predictor(Shared):
 
         None if the model has no memory states or the hypothesis no effects on inputs.
         """
-        if not (self.data.hidden and self.acting(h)):
+        if not (self.data.hidden and h.acting):
             return None
-        acting = self.acting(h)
+        acting = h.acting
         return self._kept("begun", acting, lambda: memories_moved(acting, self.data))
 
     def remembered(self, h: Hypothesis, track: Array) -> Array:
@@ -171,7 +170,7 @@ class Predictor(Shared):
             return np.asarray(flat[data.state_at.T])
 
         found = track.copy()
-        found[..., data.exact] = self._kept("memories", self.acting(h), make, p.tobytes())
+        found[..., data.exact] = self._kept("memories", h.acting, make, p.tobytes())
         return found
 
     def _kept(
@@ -181,11 +180,6 @@ class Predictor(Shared):
         found = self._inputs.setdefault(what, Cache(4_000_000, least=64))
         values = tuple((e.name, tuple(sorted(v.items()))) for e, v in acting)
         return found.made((beside, *values), make)
-
-    @staticmethod
-    def acting(h: Hypothesis) -> list[tuple[Effect, Mapping[str, float]]]:
-        """Return the effects on inputs with their values, in the order in which they act."""
-        return [h.pairs[i] for i in acting_order([effect.family for effect in h.effects])]
 
     def params(self, h: Hypothesis) -> Array:
         """Return the model's parameters under a hypothesis (k,), or per row (M, k)."""
@@ -280,7 +274,7 @@ class Predictor(Shared):
         if medium := moving(h, self.seen):
             after = self.advance(medium.still, medium.through(x), u, t)
             return self.logged(h, x, medium.over(after, self.data.dt))
-        dt, rates, limits = self.data.dt, rates_of(h), limits_of(h)
+        dt, rates, limits = self.data.dt, h.rates, h.limits
         if not rates and not limits:
             return self.moved(h, x, u)
         needs_own = any(e.family.needs_own for e, _ in rates)
@@ -344,7 +338,7 @@ class Predictor(Shared):
             return None
         if width == model.m:
             return np.asarray(march(x, u, self.params(h), self.data.dt))
-        parts = delayed(self.acting(h), self.data) if self.divisible else None
+        parts = delayed(h.acting, self.data) if self.divisible else None
         if parts is None or behind_logs(model) is not None:
             return None
         split = self._split(u, parts)
@@ -380,7 +374,7 @@ class Predictor(Shared):
         factor is left out where the step is not divisible.
         """
         p, m = self.params(h), self.data.model.m
-        parts = delayed(self.acting(h), self.data) if self.divisible else None
+        parts = delayed(h.acting, self.data) if self.divisible else None
         if parts is None:
             mean, lead = u[..., :m], u[..., m:]
             after = self.step(x, mean, p)
@@ -416,7 +410,7 @@ class Predictor(Shared):
     def left(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Left:
         """Return inputs u (..., m) less the losses at x (..., n), and position terms (`ahead`)."""
         names = self.data.model.input_names
-        if not (pairs := losses_of(self.with_memory(h, x))):
+        if not (pairs := self.with_memory(h, x).losses):
             return u, {}
         found, at, dt = u.copy(), self.loads(h, x, u, dt), dt or self.data.dt
         taken = solved(pairs, at, dt)
@@ -427,7 +421,7 @@ class Predictor(Shared):
     def loads(self, h: Hypothesis, x: Array, u: Array, dt: float | None = None) -> Loads:
         """Return what losses are solved from: speeds before, after without loss, gains, inputs."""
         names, p = self.data.model.input_names, self.params(h)
-        drives = tuple(effect.site.targets for effect, _ in losses_of(h))
+        drives = tuple(effect.site.targets for effect, _ in h.losses)
         rows = blake2b(x.tobytes() + u.tobytes() + p.tobytes()).digest()
 
         def step(a: Named) -> Named:
@@ -438,12 +432,12 @@ class Predictor(Shared):
             weights = self.weights(h, p, x.shape[:-1])
             slopes = self.taken.about(self.flat(x, u)[0]) if dt is None and self._taken else None
             if slopes is None:
-                return loads(losses_of(h), self.named(x), a, step, weights)
+                return loads(h.losses, self.named(x), a, step, weights)
             # cached slopes by the inputs are accurate enough
             by_u = slopes[1].reshape(*x.shape, len(names))
-            driving = {coupled(effect.site)[0] for effect, _ in losses_of(h)}
+            driving = {coupled(effect.site)[0] for effect, _ in h.losses}
             answers = {tau: self.named(by_u[..., names.index(tau)]) for tau in driving}
-            return loads_from(losses_of(h), self.named(x), a, step(a), answers, weights)
+            return loads_from(h.losses, self.named(x), a, step(a), answers, weights)
 
         # the values of the losses may differ: this does not depend on them
         return self._loads.made((drives, dt, rows), make, x.size)
@@ -458,7 +452,7 @@ class Predictor(Shared):
         """
         found = list[Mapping[str, Any]]()
         each, which = np.unique(np.atleast_2d(p), axis=0, return_inverse=True)
-        for effect, _ in losses_of(h):
+        for effect, _ in h.losses:
             rows = [self._weights_at(effect, row) for row in each]
             own: Mapping[str, Any] = rows[0]
             if len(own) > 1 and len(rows) > 1:
@@ -478,10 +472,10 @@ class Predictor(Shared):
     def _weight_slopes(self, h: Hypothesis, p: Array) -> list[dict[str, Array]]:
         """Return how the weights of each loss' speed change with the parameters, (k,) each."""
         found = list[dict[str, Array]]()
-        for effect, _ in losses_of(h):
+        for effect, _ in h.losses:
             base = self._weights_at(effect, p)
             slopes = {name: np.zeros(len(p)) for name in base}
-            for i, scale in enumerate(param_scale(self.data.model) if len(base) > 1 else ()):
+            for i, scale in enumerate(self.data.model.spreads if len(base) > 1 else ()):
                 if scale:
                     more = self._weights_at(effect, p + 1e-4 * scale * (np.arange(len(p)) == i))
                     for name in base:
@@ -496,7 +490,7 @@ class Predictor(Shared):
 
         f_x, f_p: slopes of the model's own step (..., n, n), (..., n, k).
         """
-        names, pairs = self.data.model.input_names, losses_of(self.with_memory(h, x))
+        names, pairs = self.data.model.input_names, self.with_memory(h, x).losses
         f_p, m = f_x[..., :0] if f_p is None else f_p, len(names)
         by_x, by_p = (np.zeros((*x.shape[:-1], m, f.shape[-1])) for f in (f_x, f_p))
         if not pairs:
@@ -525,7 +519,7 @@ class Predictor(Shared):
 
     def limited(self, h: Hypothesis, x: Array, u: Array, t: Array) -> tuple[Array, Array]:
         """Return the model's step under the effects that limit its rates, and its mean rate."""
-        after, limits = self.moved(h, x, u), limits_of(h)
+        after, limits = self.moved(h, x, u), h.limits
         free = (after - x) / self.data.dt
         if not limits:
             return after, free

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, limits_of, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects.sensed import behind_logs
 from grounded.frozen import Array
@@ -19,17 +19,17 @@ def with_effects(
     """Return the Jacobian of a hypothesis' step from x (L, B, n), given the model's own F."""
     one, data = np.eye(x.shape[-1]), predictor.data
     F = passed(predictor, h, x, u, F, one)
-    if not rates_of(h) and not (limits_of(h) and predictor.tied):
-        return logged_slopes(predictor, h, F) if limits_of(h) else F
+    if not h.rates and not (h.limits and predictor.tied):
+        return logged_slopes(predictor, h, F) if h.limits else F
     after = predictor.advance(h, x, u, data.time) if after is None else after
     half, mean = 0.5 * data.dt, (F - one) / data.dt
     first = rate_slopes(predictor, h, x, u, data.time, mean)
     direct = rate_slopes(predictor, h, after, u, data.time + data.dt, None)
     soft = direct
-    if any(e.family.dry for e, _ in rates_of(h)):
+    if any(e.family.dry for e, _ in h.rates):
         soft = rate_slopes(predictor, h, after, u, data.time + data.dt, None, soft=True)
     later = F + half * (direct + half * soft @ direct) @ F  # where the second half leads
-    if any(e.family.needs_own for e, _ in rates_of(h)):
+    if any(e.family.needs_own for e, _ in h.rates):
         # the model's own rate used at the end is the step's mean, a function of the start
         later += half * (rate_slopes(predictor, h, after, u, data.time + data.dt, mean) - direct)
     found = later @ (one + half * first)
@@ -64,7 +64,7 @@ def passed(
     A state that moves at its limit no longer depends on the model. For that part of the step its
     slope is `still` (n, k), that of a state at rest.
     """
-    limits = limits_of(h)
+    limits = h.limits
     if not limits:
         return slopes
     data = predictor.data
@@ -105,7 +105,7 @@ def rate_slopes(
         now: use instantaneous rates, limits included, instead of means over the step.
         soft: without dry frictions.
     """
-    rates, data = [*rates_of(h), *(limits_of(h) if now else [])], predictor.data
+    rates, data = [*h.rates, *(h.limits if now else [])], predictor.data
     rates = [(e, v) for e, v in rates if not (soft and e.family.dry)]
     n, half, names = x.shape[-1], 0.5 * data.dt, data.model.state_names
     if not rates:
@@ -137,7 +137,7 @@ def heading_slope(
     f_x, _ = predictor.slopes(x, u, predictor.params(h), short)
     one, name = np.eye(x.shape[-1]), predictor.seen[heading]
     slope = (f_x[..., heading, :] - one[heading]) / short
-    acting = [*rates_of(h), *limits_of(h)]
+    acting = [*h.rates, *h.limits]
     if any(name in e.site.targets or f"{name}<-" in e.name for e, _ in acting):
         own = (f_x - one) / short
         slope += rate_slopes(predictor, h, x, u, t, own, now=True)[..., heading, :]

@@ -26,7 +26,7 @@ import numpy as np
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import Delays, delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved, shift_precision
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import (
     columns_of,
     filter_system,
@@ -386,7 +386,7 @@ def _scored(
     if k < C:
         precision = shift_precision(h, C - k)
         which = calibrated(data)
-        shift = 0.0 if h.shift is None else h.shift[which] / param_scale(data.model)[which]
+        shift = 0.0 if h.shift is None else h.shift[which] / data.model.spreads[which]
         G = gram.sum(axis=0)[k:, k:] / np.sqrt(np.outer(precision, precision))
         peak -= 0.5 * float(np.sum(precision * np.square(shift)))
         evidence = peak - 0.5 * float(np.linalg.slogdet(np.eye(C - k) + G)[1])

@@ -15,7 +15,7 @@ import numpy as np
 
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import step_sizes
 from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.frozen import Array
@@ -29,7 +29,7 @@ GAPS = 20  # most that a scanned value moves in one step, in units of `step_size
 class ProposedStep:
     """A step from the best point in values, shifts and track, and the noise that it leads to."""
 
-    delta: Array  # (C,) of the values, then of the shifts in units of param_scale
+    delta: Array  # (C,) of the values, then of the shifts in units of `Model.spreads`
     track: Array
     noise: NoiseModel
     promise: float  # gain expected by the quadratic model [nats]
@@ -123,7 +123,7 @@ def room(data: Data, h: Hypothesis, size: int) -> tuple[Array, Array]:
         which = calibrated(data)
         shift = np.zeros(data.model.system.k) if h.shift is None else h.shift
         lowest, highest = _bounds(data)
-        at, unit = data.model.values + shift, np.maximum(param_scale(data.model), 1e-300)
+        at, unit = data.model.values + shift, np.maximum(data.model.spreads, 1e-300)
         low[k:] = np.minimum((lowest - at) / unit, 0.0)[which]
         high[k:] = np.maximum((highest - at) / unit, 0.0)[which]
     return low, high

@@ -34,7 +34,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.levels import NATS, PICKED, SHARE
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.frozen import Array
@@ -117,7 +117,7 @@ def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tup
     across = G[k:, :k]
     H = G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T
     H = H + np.diag(fit.prior[k:])
-    b = h.shift[which] / param_scale(data.model)[which]
+    b = h.shift[which] / data.model.spreads[which]
     free, now = fewest(H, b, range(len(b)))
     nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
     if ruler.held_out:
@@ -149,7 +149,7 @@ def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
     """Return the fit with one parameter at nominal, the others fitted again by a Newton step."""
     h, index = fit.hypothesis, calibrated(data)[column - len(fit.hypothesis.theta)]
     assert h.shift is not None
-    shift = h.shift[index] / param_scale(data.model)[index]
+    shift = h.shift[index] / data.model.spreads[index]
     H = fit.gram.sum(axis=0) + np.diag(fit.prior)
     rest = np.delete(np.arange(len(H)), column)
     delta = np.zeros(len(H))

@@ -29,7 +29,7 @@ from grounded.diagnosis.hypotheses.leftover import filter_of
 from grounded.diagnosis.levels import HALF, WELL
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.fitted import Fitted, calibrated
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, param_scale
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import fisher
 from grounded.diagnosis.likelihood.linearise import base_columns
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -68,7 +68,7 @@ def values_of(h: Hypothesis, data: Data) -> list[Value]:
         for effect, values in h.pairs
         for q in effect.free
     ]
-    model, sizes = data.model, param_scale(data.model)
+    model, sizes = data.model, data.model.spreads
     now = model.values + (0.0 if h.shift is None else h.shift)
     for i in calibrated(data) if h.spread > 0 else ():
         name = model.param_names[i]

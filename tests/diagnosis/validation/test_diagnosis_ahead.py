@@ -8,7 +8,7 @@ import pytest
 from grounded import Trial
 from grounded.diagnosis.likelihood import marching
 from grounded.diagnosis.likelihood.data import prepare
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, losses_of, rates_of
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.joint_memory import remembering
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.validation.ruler import missed
@@ -77,8 +77,8 @@ def test_all_folds_together_are_each_alone(model, freed):
                 )
             other = missed(predictor, each[:1], 0 * which, track, MOMENTS, run, AHEAD)
             different += not np.array_equal(other, together, equal_nan=True)
-            met["rate"] += bool(rates_of(each[0]))
-            met["loss"] += bool(losses_of(each[0]))
+            met["rate"] += bool(each[0].rates)
+            met["loss"] += bool(each[0].losses)
     assert different >= 0.7 * len(by_family)
     assert met["rate"] > 5
     assert met["loss"] or model is car
@@ -94,7 +94,7 @@ def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, before, monkeypa
     by_family = {e.family.name: e for e in Library().candidates(model, data.scales)}
     for effect in by_family.values():
         h = Hypothesis().plus(effect, valued(effect, 0.5))
-        if not (rates_of(h) or losses_of(h)):
+        if not (h.rates or h.losses):
             continue
         if remembering(h):  # what a joint remembers follows from motion, whatever else acts on it
             h = h.plus(by_family["viscous_friction"], {"k": 0.4})
