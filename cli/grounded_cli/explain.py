@@ -8,11 +8,11 @@ from typing import Any
 
 from grounded.diagnosis.causes import in_words
 from grounded.effects import Family, Scales, Site
-from grounded.errors import GroundedError, alike
+from grounded.errors import GroundedError
 from grounded.findings.catalogue import WEIGHTS, codes, entry_of
 from grounded.findings.numbers import bare
 from grounded.models import car, pendulum
-from grounded.refusals import refused
+from grounded.refusals import unknown
 from grounded_cli.console.terminal import field, show
 from grounded_cli.console.workspace import open_workspace
 from grounded_trials.workspace.adopted import installed_effects
@@ -21,13 +21,11 @@ from grounded_trials.workspace.adopted import installed_effects
 def explain(name: str) -> Iterator[dict[str, Any]]:
     """Print what a code or an effect means, or list all."""
     family, _, target = name.partition(":")
-    findings = {one: vars(entry_of(one)) for one in codes() if name in ("", one)}
+    findings = {one: entry_of(one)._asdict() for one in codes() if name in ("", one)}
     library = installed_effects().families
     chosen = [one for one in library if family in ("", one.name)]
     if not findings and not chosen:
-        near = alike(name, codes()) or alike(family, [one.name for one in library]) or None
-        known = None if near else "those that `grounded explain` lists"
-        raise refused("given.name", name, kind="code or effect", near=near, known=known)
+        raise unknown("code or effect", family, [*(one.name for one in library), *codes()])
     effects = _described(chosen, target) if chosen else {}
     yield {"findings": findings, "effects": effects}
     if name:

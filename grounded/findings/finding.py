@@ -65,7 +65,7 @@ class Finding:
         """What was found, and what to do where the entry has a remedy, after its place `where`."""
         entry = entry_of(self.code)
         facts = {"about": self.about, **self.facts}
-        texts = (filled(text, facts).strip() for text in (entry.short, entry.remedy))
+        texts = (filled(text, facts).strip(" ;") for text in (entry.short, entry.remedy))
         place = f"{self.facts['where']}: " if "where" in self.facts else ""
         return place + "; ".join(text for text in texts if text)
 
@@ -81,7 +81,7 @@ class Finding:
     @property
     def remedy(self) -> str:
         """What to do about it, "" for nothing."""
-        return filled(entry_of(self.code).remedy, {"about": self.about, **self.facts}).strip()
+        return filled(entry_of(self.code).remedy, {"about": self.about, **self.facts}).strip(" ;")
 
     @property
     def what(self) -> str:

@@ -65,7 +65,7 @@ def _alike(facts: Mapping[str, Any], names: Iterable[str]) -> dict[str, str]:
 def bare(text: str) -> str:
     """Return a text to be read without facts: its slots as <name>, its clauses in brackets."""
     clauses = _CLAUSE.sub(lambda m: f"[{_IF.sub('', m[1], count=1).strip()}]", text)
-    return _SLOT.sub(lambda m: f"<{m[1]}>", clauses)
+    return _SLOT.sub(lambda m: m[2] if "/" in (m[2] or "") else f"<{m[1]}>", clauses)
 
 
 def slots(text: str) -> set[str]:

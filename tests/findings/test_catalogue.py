@@ -68,7 +68,7 @@ def test_what_follows_from_another_is_not_told(monkeypatch):
         "log.b": catalogue.Entry("warn", "b"),
         "log.c": catalogue.Entry("warn", "c"),
     }
-    monkeypatch.setattr(catalogue, "entries", lambda area: entries)
+    monkeypatch.setattr(catalogue, "ENTRIES", entries)
     a, b, other = found("log.a", "x"), found("log.b", "x"), found("log.b", "y", nats=9.0)
     c = found("log.c", "x", nats=3.0)
     assert settle([a, c, b, other, c]) == (other, c, a)

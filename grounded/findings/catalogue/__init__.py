@@ -1,29 +1,17 @@
 """The words of every finding: a code -> its weight, sentence and remedy.
 
-Read `gap` as an example. A module an area, which is the part of the code before its first dot.
-`numbers` says how slots are written. `short` says what was found and what it means, `remedy` what
-to do; `hides` names the codes (with `*`) that are only its consequences.
+Read `models` as an example. The part of a code before its first dot is its area, a table of its
+own; `numbers` says how slots are written. `short` says what was found and what it means, `remedy`
+what to do; `hides` names the codes (with `*`) that are only its consequences.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cache
-from importlib import import_module
-
-AREAS = (
-    "file",
-    "gap",
-    "given",
-    "log",
-    "model",
-    "plan",
-    "run",
-    "search",
-    "sensor",
-    "start",
-    "target",
-)
+from grounded.findings.catalogue.entry import Entry
+from grounded.findings.catalogue.files import FILE, GIVEN, START, TARGET
+from grounded.findings.catalogue.logs import LOG, RUN, SENSOR
+from grounded.findings.catalogue.models import GAP, MODEL
+from grounded.findings.catalogue.plans import PLAN, SEARCH
 
 WEIGHTS = {
     "refuse": "the command stops",
@@ -31,37 +19,27 @@ WEIGHTS = {
     "warn": "what was done may be wrong",
     "note": "good to know; nothing stops and everything counts",
 }
-
-
-@dataclass(frozen=True)
-class Entry:
-    """The words of one code.
-
-    Args:
-        weight: one of `WEIGHTS`, which says what it means.
-        short: what was found, a clause without a full stop.
-        remedy: what to do about it, "" for nothing.
-        hides: codes of findings that follow from it.
-    """
-
-    weight: str
-    short: str
-    remedy: str = ""
-    hides: tuple[str, ...] = ()
-
-
-@cache
-def entries(area: str) -> dict[str, Entry]:
-    """Return the entries of an area by code."""
-    module = import_module(f"{__name__}.{area}")
-    return {f"{area}.{name}": entry for name, entry in module.ENTRIES.items()}
+AREAS = {
+    "file": FILE,
+    "gap": GAP,
+    "given": GIVEN,
+    "log": LOG,
+    "model": MODEL,
+    "plan": PLAN,
+    "run": RUN,
+    "search": SEARCH,
+    "sensor": SENSOR,
+    "start": START,
+    "target": TARGET,
+}
+ENTRIES = {f"{area}.{name}": one for area, table in AREAS.items() for name, one in table.items()}
 
 
 def entry_of(code: str) -> Entry:
     """Return the entry of a code; KeyError if there is none."""
-    return entries(code.partition(".")[0])[code]
+    return ENTRIES[code]
 
 
 def codes() -> list[str]:
     """Return all codes, area by area."""
-    return [code for area in AREAS for code in entries(area)]
+    return [*ENTRIES]

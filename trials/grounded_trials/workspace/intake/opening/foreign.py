@@ -139,7 +139,7 @@ class ForeignLog:
             )
             late = Quantity(grid.late_s, "s")
             raise GroundedError(
-                found("log.late_states", log=str(self.path), late=late, put_off=put_off)
+                found("log.late_states", where=str(self.path), late=late, put_off=put_off)
             )
 
     @property

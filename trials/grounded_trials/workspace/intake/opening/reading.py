@@ -105,7 +105,7 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         trial = replace(trial, candidate="")
         return Read(trial, encode(workspace, trial, kept_of))
     if candidate is not None and trial.candidate not in ("", candidate):
-        raise refused("log.another", log=str(path), ran=candidate, other=trial.candidate)
+        raise refused("log.another", where=str(path), ran=candidate, other=trial.candidate)
     if trial.candidate:
         check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
         return Read(trial, content, bare=policy is None)

@@ -393,7 +393,7 @@ def _refusal(case: Case, story: Story) -> GroundedError:
         then, told = data, told.also(guessed=tuple(sorted(case.guessed)))
         if case.log and 0 < _lasting_s(case.log) < WHOLE * case.task.horizon * case.task.dt:
             told = told.also(lasts=Quantity(_lasting_s(case.log), "s"))
-    return GroundedError(told.also(log=path).weighing(Weight.REFUSE), then)
+    return GroundedError(told.also(where=path).weighing(Weight.REFUSE), then)
 
 
 def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:

@@ -1,0 +1,25 @@
+"""Entry: the words of one finding; note, warn, aside and refuse make one of that weight."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+
+class Entry(NamedTuple):
+    """The words of one code.
+
+    Args:
+        weight: one of `WEIGHTS`, which says what it means.
+        short: what was found, a clause without a full stop.
+        remedy: what to do about it, "" for nothing.
+        hides: codes of findings that follow from it.
+    """
+
+    weight: str
+    short: str
+    remedy: str = ""
+    hides: tuple[str, ...] = ()
+
+
+note, warn, aside, refuse = (partial(Entry, one) for one in ("note", "warn", "aside", "refuse"))
