@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import needs
-from grounded.figures.body import Body
+from grounded.figures.figure import Body
 from grounded.frozen import Array
 from grounded.model import Model
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -98,6 +98,20 @@ class Figure:
     caption: str
     panels: Sequence[Panel]
     key: Sequence[Key] = ()
+
+
+class Body(Protocol):
+    """A moving robot as a stick figure in space, and the path of its end."""
+
+    @property
+    def unit(self) -> str:
+        """Unit of positions; "" if its size is unknown."""
+
+    def sticks(self, states: Array) -> Array:
+        """Return the ends (T, S, 2, 3) of S lines for states (T, n)."""
+
+    def path(self, states: Array) -> Array:
+        """Return positions (T, 3) of the body, or its end; NaN where a state is unknown."""
 
 
 def typeset(value: Any) -> Any:

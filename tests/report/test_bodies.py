@@ -1,11 +1,11 @@
-"""Bodies: links and carriages where the angles say; a MuJoCo file's own geometry."""
+"""Bodies: links and carriages where the angles say; the joints of a MuJoCo file."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from grounded.models import arm, cart_pole, pendulum
+from grounded.models import arm, car, cart_pole, pendulum
 from grounded_trials.report.bodies import body_of, is_mechanism, scene_of
 
 
@@ -31,16 +31,21 @@ def test_the_tip_is_where_the_angles_say(model, state, tip):
 
 
 @pytest.mark.parametrize("model", [pendulum.model, cart_pole.model, arm.model])
-def test_each_link_points_to_the_next_joint(model):
+def test_each_link_ends_at_the_next_joint(model):
     body, states = _body(model), np.random.default_rng(0).normal(size=(5, model.n))
-    links = [part for part in body.parts if part.shape == "capsule"]
-    poses = body.poses(states)[: len(links)]
-    ends = [
-        at + part.size[1] * turned[:, :, 2] for part, (at, turned) in zip(links, poses, strict=True)
-    ]
-    for end, (joint, _) in zip(ends, poses[1:], strict=False):
-        np.testing.assert_allclose(end, joint, atol=1e-9)
-    np.testing.assert_allclose(ends[-1], body.path(states), atol=1e-9)
+    sticks = body.sticks(states)
+    np.testing.assert_array_equal(sticks[:, :-1, 1], sticks[:, 1:, 0])
+    np.testing.assert_array_equal(sticks[:, -1, 1], body.path(states))
+    np.testing.assert_allclose(
+        np.ptp(np.linalg.norm(np.diff(sticks, axis=2), axis=3), axis=0), 0, atol=1e-12
+    )
+
+
+@pytest.mark.parametrize(("heading", "ahead"), [(0.0, (1, 0, 0)), (np.pi / 2, (0, 1, 0))])
+def test_a_vehicle_points_ahead(heading, ahead):
+    states = np.where(np.array(car.model.state_names) == "psi", heading, 0.0)[None]
+    nose = _body(car.model).sticks(states)[0, 0, 0]
+    np.testing.assert_allclose(nose / np.linalg.norm(nose), ahead, atol=1e-12)
 
 
 MJCF = """
@@ -50,7 +55,6 @@ MJCF = """
     <body name="cart">
       <joint name="x" type="slide" axis="1 0 0"/>
       <geom type="box" size="0.2 0.1 0.05" mass="1"/>
-      <geom type="sphere" size="9" mass="0" group="4"/>
       <body name="pole" pos="0 0 0.05">
         <joint name="theta" axis="0 1 0"/>
         <geom type="capsule" fromto="0 0 0 0 0 1" size="0.03" mass="0.2"/>
@@ -69,13 +73,11 @@ def test_a_mujoco_model_looks_as_its_file_says():
     from grounded.adapters import mujoco
 
     body = _body(mujoco.model(MJCF))
-    shapes = [part.shape for part in body.parts]
-    assert shapes == ["box", "capsule"]  # cart, pole
     states = np.array([[0.7, np.pi / 2, 0.0, 0.0]])  # the pole lies along +x
-    poses = body.poses(states)
-    np.testing.assert_allclose(poses[0][0][0], [0.7, 0, 0], atol=1e-9)
-    start, along = poses[1][0][0], poses[1][1][0, :, 2] * body.parts[1].size[1]
-    ends = np.sort([start, start + along], axis=0)
-    np.testing.assert_allclose(ends, [[0.7, 0, 0.05], [1.7, 0, 0.05]], atol=1e-9)
-    np.testing.assert_allclose(body.path(states)[0], [2.2, 0, 0.05], atol=1e-9)
+    ends = [[0.7, 0, 0.05], [1.7, 0, 0.05], [2.2, 0, 0.05]]  # pole, weight, the weight's centre
+    sticks = body.sticks(states)[0]
+    np.testing.assert_allclose(
+        sticks[[0, 1, -1]], [[[0.7, 0, 0], ends[0]], ends[:2], ends[1:]], atol=1e-9
+    )
+    np.testing.assert_allclose(body.path(states)[0], ends[-1], atol=1e-9)
     assert np.isnan(body.path(np.full((1, 4), np.nan))).all()

@@ -1,10 +1,10 @@
-"""Bodies: the shape and pose of a robot in each state, from the roles of its model, and its scene.
+"""Bodies: a robot as a stick figure in each state, from the roles of its model, and its scene.
 
-    position                    a car from above, or an aircraft, along its path
+    position                    a kite that points ahead, along its path
     hanging, upright, level     a chain of links in a vertical plane: the angles of their joints,
                                 where the first is zero downwards, upwards, or along x
     rail                        the position of a carriage that carries the links
-    a MuJoCo model              the geometry of its file
+    a MuJoCo model              the joints of its file
     none of these               a dot in the plane of the first two states
 
 A `Scene` is the position and orientation of a body in space:
@@ -23,32 +23,22 @@ only parameter in m, whatever its name. If the lengths are unknown, links have e
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from grounded.figures.body import Body, Part, Pose
+from grounded.figures.figure import Body
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded_trials.report.findings import Findings
 from grounded_trials.workspace.off_target import asked_for, position_axes, roles_of, tracked
 
-CAR = (
-    [(-0.5, -0.25, 0), (0.5, -0.25, 0), (0.5, 0.25, 0), (-0.5, 0.25, 0), (-0.5, -0.25, 0)],
-    [(0.5, -0.25, 0), (0.85, 0, 0), (0.5, 0.25, 0)],
-)
-AIRCRAFT = (
-    [(-0.6, 0, 0), (0.5, 0, 0)],
-    [(-0.1, 0.8, 0), (0.2, 0, 0), (-0.1, -0.8, 0), (-0.1, 0.8, 0)],
-    [(-0.6, 0.25, 0), (-0.6, -0.25, 0)],
-    [(-0.4, 0, 0), (-0.65, 0, 0.25), (-0.6, 0, 0)],
-)
+# nose, right, tail, left, and the top of a fin; (nose, left, up) axes, for a length of 1
+CORNERS = np.array([(0.6, 0, 0), (-0.4, -0.4, 0), (-0.2, 0, 0), (-0.4, 0.4, 0), (-0.4, 0, 0.3)])
+KITE = CORNERS[[(0, 1), (1, 2), (2, 3), (3, 0), (2, 4)]]  # its edges (5, 2, 3)
 ZEROS = {"hanging": (-np.pi / 2, 1), "upright": (np.pi / 2, -1), "level": (0.0, 1)}
 LENGTH = 0.07  # size of a vehicle, as a fraction of the paths' size
-SLIM = 0.06  # radius of a link, as a fraction of the longest link
-CARRIAGE = (0.25, 0.12, 0.1)  # half edges of the carriage, as fractions of the links' length
 NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east, north, up
 
 
@@ -166,7 +156,7 @@ def _lengths(model: Model, count: int) -> tuple[float, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Vehicle:
-    """A mark along a path, drawn as a car, an aircraft, or a dot."""
+    """A mark along a path: a kite in space, in a phase plane a dot."""
 
     scene: Scene
     size: float
@@ -176,17 +166,11 @@ class Vehicle:
         """The unit of the first axis."""
         return self.scene.units[0]
 
-    @property
-    def parts(self) -> Sequence[Part]:
-        """The single part."""
-        if not self.scene.spatial:
-            return (Part("", "dot"),)
-        drawn = AIRCRAFT if self.scene.volume else CAR
-        return (Part("", "lines", strips=tuple(self.size * np.array(s) for s in drawn)),)
-
-    def poses(self, states: Array) -> list[Pose]:
-        """Return the pose given by position, and heading or attitude."""
-        return [(self.scene.points(states), self.scene.rotations(states))]
+    def sticks(self, states: Array) -> Array:
+        """Return the kite's edges (T, 5, 2, 3), turned by heading or attitude; none of a dot."""
+        kite = self.size * (KITE if self.scene.spatial else KITE[:0])
+        turned = np.einsum("tij,skj->tski", self.scene.rotations(states), kite)
+        return np.asarray(self.path(states)[:, None, None] + turned)
 
     def path(self, states: Array) -> Array:
         """Return the positions (T, 3)."""
@@ -204,44 +188,23 @@ class Links:
     unit: str
     rail: tuple[int, ...] = ()  # index of the carriage's state, or empty
 
-    @property
-    def parts(self) -> Sequence[Part]:
-        """The links, then the carriage."""
-        thin = SLIM * max(self.lengths)
-        links = [Part(f"link{i}", "capsule", (thin, one)) for i, one in enumerate(self.lengths, 1)]
-        size = tuple(part * sum(self.lengths) for part in CARRIAGE)
-        return [*links, *[Part("carriage", "box", size)] * bool(self.rail)]
-
-    def poses(self, states: Array) -> list[Pose]:
-        """Return the pose of each link at its joint, with z along it; then the carriage's."""
-        joints, along = self._chain(states)
-        turned = [_upright(angle) for angle in along]
-        still = np.tile(np.eye(3), (len(states), 1, 1))
-        found: list[Pose] = list(zip(joints, turned, strict=False))
-        return [*found, *[(joints[0], still)] * bool(self.rail)]
+    def sticks(self, states: Array) -> Array:
+        """Return each link from its joint to the next (T, k, 2, 3)."""
+        joints = self._joints(states)
+        return np.stack([joints[:, :-1], joints[:, 1:]], axis=2)
 
     def path(self, states: Array) -> Array:
         """Return the positions of the last link's end (T, 3)."""
-        return self._chain(states)[0][-1]
+        return self._joints(states)[:, -1]
 
-    def _chain(self, states: Array) -> tuple[list[Array], list[Array]]:
-        """Return positions of joints and tip (T, 3), and each link's angle from x to z (T,)."""
-        base = np.zeros((len(states), 3))
-        if self.rail:
-            base[:, 0] = states[:, self.rail[0]]
+    def _joints(self, states: Array) -> Array:
+        """Return positions of joints and tip (T, k + 1, 3)."""
         turned = self.zero + self.sign * np.cumsum(states[:, list(self.angles)], axis=1)
-        joints = [base]
-        for length, angle in zip(self.lengths, turned.T, strict=True):
-            step = np.stack([np.cos(angle), 0 * angle, np.sin(angle)], axis=1)
-            joints.append(joints[-1] + length * step)
-        return joints, list(turned.T)
-
-
-def _upright(angle: Array) -> Array:
-    """Return rotation matrices (T, 3, 3) that turn z to an angle from x to z (T,)."""
-    cos, sin, no = np.cos(angle), np.sin(angle), np.zeros(len(angle))
-    rows = [(sin, no, cos), (no, no + 1, no), (-cos, no, sin)]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+        steps = np.stack([np.cos(turned), 0 * turned, np.sin(turned)], axis=2)
+        base = np.zeros((len(states), 1, 3))
+        if self.rail:
+            base[:, 0, 0] = states[:, self.rail[0]]
+        return np.cumsum(np.hstack([base, steps * np.array(self.lengths)[:, None]]), axis=1)
 
 
 def reach(body: Body, states: Array) -> Array:
@@ -250,5 +213,5 @@ def reach(body: Body, states: Array) -> Array:
     known = states[np.isfinite(path).all(axis=1)]
     if not len(known) or not is_mechanism(body):
         return finite(path)
-    chosen = np.nan_to_num(known[np.unique(np.linspace(0, len(known) - 1, 60).astype(int))])
-    return np.vstack([finite(path), *(origin for origin, _ in body.poses(chosen))])
+    chosen = np.nan_to_num(known[:: max(1, len(known) // 60)])
+    return np.vstack([finite(path), body.sticks(chosen).reshape(-1, 3)])

@@ -26,9 +26,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from grounded.figures.body import Body, Part
 from grounded.figures.figure import COLOURS as PAGE
-from grounded.figures.figure import Figure, Panel, rgb, typeset
+from grounded.figures.figure import Body, Figure, Panel, rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.plain_file import unwritable
@@ -53,7 +52,6 @@ DISTANCE = 1.4  # of the camera, times the size of the contents
 TRIALS = 60  # largest number of trials with a tab of their own
 SIGNALS = {"state": "states", "input": "inputs", "bias": "bias"}  # of a trial
 FIRST = {"states": 4, "inputs": 2, "bias": 2}  # plots in the overview; all have a tab
-Colour = tuple[int, int, int]
 
 
 def write_recording(findings: Findings, path: Path) -> None:
@@ -209,16 +207,19 @@ class _Recorder:
     def moving(self, at: str, states: Array, colour: str, path: str = "") -> None:
         """Record the path of states, and the body that moves and turns along it."""
         self.path(at + path, states, colour)
-        rows, parts = np.flatnonzero(np.isfinite(states).all(axis=1)), self.body.parts
-        rows = rows[:: max(1, len(rows) * len(parts) // FRAMES)]
+        rows = np.flatnonzero(np.isfinite(states).all(axis=1))
+        rows = rows[:: max(1, len(rows) // FRAMES)]
         if not len(rows):
             return
+        sticks, look = self.body.sticks(states[rows]), {"colors": COLOURS[colour]}
+        columns = rr.LineStrips3D.columns(strips=sticks.reshape(-1, 2, 3))
+        columns = columns.partition([sticks.shape[1]] * len(rows))
+        self.log(f"{at}/body", rr.LineStrips3D.from_fields(**look, radii=rr.Radius.ui_points(2)))
+        if not sticks.size:
+            columns = rr.Points3D.columns(positions=self.body.path(states[rows]))
+            self.log(f"{at}/body", rr.Points3D.from_fields(**look, radii=rr.Radius.ui_points(6)))
         times = [rr.TimeColumn("time", duration=rows * self.dt)]
-        for part, (origin, turned) in zip(parts, self.body.poses(states[rows]), strict=True):
-            entity = f"{at}/body/{part.name}" if part.name else f"{at}/body"
-            self.log(entity, drawn(part, COLOURS[colour], ghost=colour == "predicted"))
-            pose = rr.Transform3D.columns(translation=origin, mat3x3=turned)
-            self.stream.send_columns(entity, times, pose)
+        self.stream.send_columns(f"{at}/body", times, columns)
 
     def path(self, at: str, states: Array, colour: str) -> None:
         """Record a path in space as one static line."""
@@ -253,25 +254,6 @@ class _Recorder:
         middle = 0.5 * (dt - self.dt)  # of means over several steps
         times = [rr.TimeColumn("time", duration=np.arange(steps) * dt + middle)]
         self.stream.send_columns(at, times, scalars.partition([width] * steps))
-
-
-def drawn(part: Part, colour: Colour, ghost: bool = False) -> Any:
-    """Return the archetype of a part in one colour; ghosts (predictions) as wireframes."""
-    modes, size = rr.components.FillMode, part.size
-    look: Any = {"colors": colour, "fill_mode": modes.MajorWireframe if ghost else modes.Solid}
-    if part.shape == "box":
-        return rr.Boxes3D(half_sizes=[size], **look)
-    if part.shape == "ellipsoid":
-        return rr.Ellipsoids3D(half_sizes=[size], **look)
-    if part.shape in ("capsule", "cylinder"):
-        kind = rr.Capsules3D if part.shape == "capsule" else rr.Cylinders3D
-        return kind(radii=[size[0]], lengths=[size[1]], **look)
-    if part.shape == "mesh":
-        faces = part.faces.astype(np.uint32)
-        return rr.Mesh3D(vertex_positions=part.points, triangle_indices=faces, albedo_factor=colour)
-    if part.shape == "lines":
-        return rr.LineStrips3D(part.strips, colors=colour, radii=rr.Radius.ui_points(2))
-    return rr.Points3D([[0, 0, 0]], colors=colour, radii=rr.Radius.ui_points(6))
 
 
 # the views of the viewer
