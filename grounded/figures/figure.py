@@ -48,7 +48,6 @@ CONTEXT = 300  # most points of a curve that is only context
 LETTER = 0.045  # width of a letter of a bar's text, as a share of the longest bar
 LABEL_LETTERS = 26  # most letters in a line of a bar's label
 TICKS = 5  # most ticks of a logarithmic axis
-FACTORS = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # factors by which deviations may be enlarged
 Trace = dict[str, Any]
 
 
@@ -412,16 +411,16 @@ def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]
     return low - room, high + room
 
 
-def without_astray(kept: list[Array], more: list[Array], most: float = 3.0) -> list[Array]:
-    """Return `kept`, and `more` with values far outside the range of `kept` set to NaN.
+def calm_range(
+    calm: Sequence[Array], wild: Sequence[Array], most: float = 5.0
+) -> tuple[float, float]:
+    """Return a range around all values, or of the calm ones if all span `most` times as much.
 
-    Far is more than `most` times the size of the range. So a crashed first run does not flatten
-    the picture of the others.
+    So a run that diverges does not flatten the picture of the others.
     """
-    low, high = fitted(kept, 0.0)
-    span = (high - low) * most
-    inside = [np.where((v >= low - span) & (v <= high + span), v, np.nan) for v in more]
-    return [*kept, *inside]
+    (low, high), (left, right) = fitted(calm), fitted([*calm, *wild])
+    moves = any(np.ptp(v[np.isfinite(v)]) > 0 for v in calm if np.isfinite(v).any())
+    return (low, high) if moves and right - left > most * (high - low) else (left, right)
 
 
 def log_ticks(low: float, high: float) -> list[float]:
@@ -436,14 +435,6 @@ def log_ticks(low: float, high: float) -> list[float]:
     if len(values) < 2:
         return sorted(float(f"{10.0**v:.2g}") for v in np.linspace(low, high, 4))
     return values[:: -(-len(values) // (TICKS + 2))]  # of many powers of ten every second, third
-
-
-def enlarging(path: Array, desired: Array) -> float:
-    """Return a round factor that makes the deviation of a path (T, 2) from the desired visible."""
-    off = np.abs(path - desired[: len(path)])[:, :2]
-    off = off[np.isfinite(off)]
-    room = 0.2 * np.ptp(desired[:, :2], axis=0).max()
-    return max((f for f in FACTORS if len(off) and f * off.max() <= room), default=1.0)
 
 
 def thinned(x: Array, y: Array, most: int) -> NDArray[np.intp]:

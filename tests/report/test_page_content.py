@@ -5,29 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.runs import error_figure, state_figure
-from grounded_trials.report.findings import ESTIMATED, Log
+from grounded_trials.report.findings import ESTIMATED
 from grounded_trials.report.page import page
-from grounded_trials.report.tables import forecast_table
 from reported import car, cart, gathered
 
 __all__ = ["car", "cart"]
-
-
-@pytest.mark.parametrize("logs", [1, 24])
-def test_every_trial_has_a_row_for_each_model_in_the_table_of_forecasts(cart, logs):
-    findings = gathered(cart)
-    trial = findings.runs[0].trial
-    data = tuple(
-        Log(replace(trial, id=f"d{k:02d}"), findings.runs[0].residual) for k in range(logs)
-    )
-    _, made = forecast_table(replace(findings, runs=(), logs=data, better=None))
-    assert len(made.header) == 2 + len(findings.task.model.states)
-    assert [row[0] for row in made.rows] == [log.trial.id for log in data]
-    assert {len(row) for row in made.rows} == {len(made.header)}
 
 
 def weighed(findings, **weights):

@@ -19,13 +19,14 @@ from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
 from grounded.search.first_policy import first_policy
+from grounded.search.pictures import few
 from grounded.search.planner import Planner
 from grounded.trial import Trial
 from grounded_trials.report.bodies import scene_of
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
-from grounded_trials.report.forecast import forecast, forecast_error
-from reported import car, cart, gathered
+from grounded_trials.report.forecast import forecast
+from reported import car, cart, gathered, many_flights
 
 __all__ = ["car", "cart"]
 
@@ -78,20 +79,23 @@ def swung():
     return task, Trial(made.states, made.inputs, task.dt, *names, start_inputs=task.past)
 
 
+def _missed(task, model, trial, seconds):
+    """The largest error of forecasts of a trial, by state."""
+    task = task.with_model(model)
+    times, states = forecast(Planner(task, task), trial, seconds)
+    at = np.rint(times / task.dt).astype(int)
+    assert np.isnan(states).any(axis=1).sum() >= trial.steps * task.dt / seconds
+    return np.nanmax(np.abs(states - trial.states[at]), axis=0)
+
+
 def test_a_forecast_with_the_true_model_stays_on_the_trial_and_others_part_from_it(swung):
     task, trial = swung
-    found = forecast(Planner(task, task), trial, 0.5)
-    real = trial.states[np.maximum(found.steps, 0)]
-    np.testing.assert_allclose(found.states[found.steps >= 0], real[found.steps >= 0], atol=1e-9)
-    assert forecast_error(Planner(task, task), trial).max() < 1e-9
-    times, values = found.curve(0, task.dt)
-    assert len(times) == len(values) and np.isnan(values).sum() >= len(found.steps)
-    wrong = task.with_model(task.model.with_values({"m": 1.3}))
-    short, long = (forecast_error(Planner(wrong, wrong), trial, s)[0] for s in (0.1, 1.0))
+    assert _missed(task, task.model, trial, 0.5).max() < 1e-9
+    wrong = task.model.with_values({"m": 1.3})
+    short, long = (_missed(task, wrong, trial, seconds)[0] for seconds in (0.1, 1.0))
     assert 1e-6 < short < long
-    lost = replace(trial, states=np.full((3, 2), np.nan), inputs=np.zeros((2, 1)))
-    assert forecast(Planner(task, task), lost) is None
-    assert np.isnan(forecast_error(Planner(task, task), lost)).all()
+    cut = replace(trial, states=np.vstack([trial.states[:8], trial.states[8:] * np.nan]))
+    assert np.isfinite(forecast(Planner(task, task), cut, 0.5)[1]).all(axis=1).sum() == 8
 
 
 @pytest.mark.extra("notebook")
@@ -175,3 +179,12 @@ def _bars(panel):
     """The label and the value of each bar, from the top."""
     labels, (trace,) = panel.layout["yaxis"]["ticktext"], panel.data
     return [*zip(labels[::-1], trace["x"][::-1].tolist(), strict=True)]
+
+
+def test_few_candidates_are_the_first_the_improvements_and_the_latest():
+    history = many_flights(30).history
+    assert few(history, 30) == (list(history), 0)
+    shown, left = few(history, 8)
+    assert len(shown) == 8 and left == 22
+    assert shown[0] is history[0] and shown[-1] is history[-1]
+    assert [t.candidate.id for t in shown] == sorted(t.candidate.id for t in shown)

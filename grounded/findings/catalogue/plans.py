@@ -156,7 +156,7 @@ PLAN: dict[str, Entry] = {
     "coasts_out": warn(
         "after the run its runner holds {held}, and the model predicts that the robot leaves "
         "[safety] {state} = [{low}, {high}] {at} later and reaches {most}",
-        "be ready to stop the robot, switch to a holding controller after the run, or let the target "
+        "be ready to stop the robot, switch to a holding controller after it, or let the target "
         "come to rest inside",
     ),
     # a drive that excites the model's parameters

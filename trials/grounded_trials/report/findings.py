@@ -23,7 +23,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
-from grounded.trial import Trial, mean_trial
+from grounded.trial import Trial
 from grounded_trials.report.forecast import SECONDS
 from grounded_trials.store.store import Lost
 from grounded_trials.wording import rendered
@@ -52,7 +52,7 @@ class Run:
     @property
     def label(self) -> str:
         """The name in legends: t0007 (c0005)."""
-        return f"{self.trial.id} ({self.candidate.id})" if self.trial.id else self.candidate.id
+        return f"{self.trial.id} ({self.candidate.id})"
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,8 +74,8 @@ class Findings:
     effects: tuple[str, ...]  # adopted effects
     method: str  # summary of the [search] table
     standing: Standing
-    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival; see `left_runs`
-    logs: tuple[Log, ...]  # logs of this robot that ran no candidate; the latest of many
+    runs: tuple[Run, ...]  # trials of this task's candidates, in order of arrival
+    logs: tuple[Log, ...]  # logs of this robot that ran no candidate
     lost: tuple[Lost, ...]
     diagnosis: Diagnosis | None
     then: NextCommand
@@ -83,8 +83,6 @@ class Findings:
     since: Since = field(default_factory=Since)  # changes since the diagnosis
     adopted: tuple[tuple[str, str], ...] = ()  # name and values of what was adopted
     estimated: tuple[str, ...] = ()  # states that no sensor gives in some of these trials
-    left_runs: int = 0  # runs that were not read, since there are too many
-    left_logs: int = 0  # logs that were not read
     folder: str | None = None  # as the user named it, None for the current folder
 
     @property
@@ -159,44 +157,33 @@ class Findings:
 
     @cached_property
     def first(self) -> Run | None:
-        """The run of the model's own policy, if that is the first candidate with a trial."""
-        run = next((t for t in self.history if t.trials), None)
-        return None if run is None or run.candidate.base else self._mean(run.candidate.id)
+        """The latest run of the model's own policy, if that is the first candidate with a trial."""
+        tried = next((t for t in self.history if t.trials), None)
+        return None if tried is None or tried.candidate.base else self._latest(tried)
 
     @cached_property
     def best(self) -> Run | None:
-        """The run of the best candidate so far; several trials of it are averaged."""
-        best = self.standing.incumbent
-        return None if best is None else self._mean(best.candidate.id)
+        """The latest run of the best candidate so far."""
+        return self._latest(self.standing.incumbent)
 
     @cached_property
     def lately(self) -> Run | None:
-        """The latest run of the best candidate, else the latest run; unlike `best`, no average."""
-        best = self.best and self.runs_of(self.best.candidate.id)[-1]
-        return best or (self.runs[-1] if self.runs else None)
+        """The latest run of the best candidate, else the latest run."""
+        return self.best or (self.runs[-1] if self.runs else None)
 
     @cached_property
     def improvements(self) -> tuple[Run, ...]:
-        """The runs of the accepted candidates, by iteration, starting with the model's policy."""
-        found = [self._mean(t.candidate.id) for t in self.history if t.accepted]
+        """A run of each accepted candidate, by iteration, starting with the model's policy."""
+        found = [self._latest(tried) for tried in self.history if tried.accepted]
         return tuple(run for run in found if run is not None)
 
-    def _mean(self, candidate: str) -> Run | None:
-        runs = self.runs_of(candidate)
-        if not runs:
-            return None
-        if len(runs) == 1 or len({r.trial.steps for r in runs}) > 1:
-            return runs[0]
-        trial = mean_trial([r.trial for r in runs], self.task.model.angle_mask)
-        explained = [r.explained for r in runs if r.explained is not None]
-        return Run(
-            trial,
-            runs[0].candidate,
-            runs[0].accepted,
-            float(np.mean([r.utility for r in runs])),
-            np.mean([r.residual for r in runs], axis=0),
-            np.mean(explained, axis=0) if len(explained) == len(runs) else None,
-        )
+    def tried_of(self, run: Run) -> Tried:
+        """Return a run's candidate with all its trials."""
+        return next(t for t in self.history if t.candidate.id == run.candidate.id)
+
+    def _latest(self, tried: Tried | None) -> Run | None:
+        runs = () if tried is None else self.runs_of(tried.candidate.id)
+        return runs[-1] if runs else None
 
 
 def compared(findings: Findings) -> list[tuple[str, Run]]:
@@ -214,10 +201,7 @@ def prediction_error(task: Task, run: Run) -> Array:
 
 
 def off_target(findings: Findings, run: Run) -> list[Array]:
-    """Return the tracking errors (T + 1, n) of each trial of a run's candidate.
-
-    The errors of the averaged run would be smaller.
-    """
+    """Return the tracking errors (T + 1, n) of each trial of a run's candidate."""
     runs = findings.runs_of(run.candidate.id)
     return [tracking_error(findings.task, one.trial) for one in runs]
 

@@ -20,7 +20,7 @@ from grounded.search.standing import Standing
 from grounded.solve.bias import residuals
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.report.findings import Findings, Log, Run, selection
+from grounded_trials.report.findings import Findings, Log, Run
 from grounded_trials.report.forecast import anchored
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
@@ -34,9 +34,6 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.next_step import Situation
 
-MOST_RUNS = 200  # number of runs that are read: the latest, and those of compared candidates
-LOGS = 50  # number of logs that are read, the latest
-IMPROVEMENTS_READ = 5  # number of improvements whose runs are always read
 RUNAWAY = 1e15  # in any unit: larger values mean that a run diverged
 
 
@@ -52,7 +49,7 @@ def gather(workspace: Folder) -> Findings:
     own = [t for t in fitting if t.candidate in known]
     data = [t for t in fitting if not t.candidate]
     now, asked = _standing(workspace, contents)
-    shown, logs = _shown(now, own), [_drawable(t) for t in data[-LOGS:]]
+    logs = [_drawable(t) for t in data]
 
     # the last diagnosis, and the model with what it found
     diagnosis: Diagnosis | None = None
@@ -76,7 +73,7 @@ def gather(workspace: Folder) -> Findings:
         effects=tuple(str(e["name"]) for e in workspace.config.model.effects),
         method=_method(workspace),
         standing=now,
-        runs=tuple(_runs(task, now, shown, better, lost)),
+        runs=tuple(_runs(task, now, own, better, lost)),
         logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
         lost=tuple(lost),
         diagnosis=diagnosis,
@@ -84,9 +81,7 @@ def gather(workspace: Folder) -> Findings:
         better=better,
         since=since,
         adopted=adopted_rows(workspace, diagnosis),
-        estimated=_estimated(task, contents, {t.id for t in [*shown, *logs]}),
-        left_runs=len(own) - len(shown),
-        left_logs=len(data) - len(logs),
+        estimated=_estimated(task, contents, {t.id for t in fitting}),
         folder=workspace.address,
     )
 
@@ -96,17 +91,6 @@ def _estimated(task: Task, contents: Contents, drawn: Collection[str]) -> tuple[
     told = [t.meta.get("estimated", "").split(",") for t in contents.trials if t.trial.id in drawn]
     found = {name for names in told for name in names}
     return tuple(name for name in task.model.state_names if name in found)
-
-
-def _shown(now: Standing, trials: list[Trial]) -> list[Trial]:
-    """Return the trials to read: all, or of many the latest and those of compared candidates."""
-    if len(trials) <= MOST_RUNS:
-        return trials
-    compared = [t for t in now.history if t.trials][:1]
-    compared += selection([t for t in now.history if t.accepted], IMPROVEMENTS_READ)
-    names = {t.candidate.id for t in compared}
-    latest = {t.id for t in trials[-MOST_RUNS:]}
-    return [t for t in trials if t.id in latest or t.candidate in names]
 
 
 def _standing(workspace: Folder, contents: Contents) -> tuple[Standing, NextCommand | None]:

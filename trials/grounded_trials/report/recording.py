@@ -195,8 +195,8 @@ class _Recorder:
         self.rates(f"{at}/bias", residual)
 
     def rates(self, at: str, residual: Array) -> None:
-        """Record a residual (T, n) as rates; averaged if noisy."""
-        step = max(window_of([column]) for column in residual.T)
+        """Record a residual (T, n) as rates, averaged over some steps."""
+        step = window_of(len(residual))
         units = {name: per_second(unit) for name, unit in self.task.model.states.items()}
         self.columns(at, averaged(residual, step) / self.dt, step * self.dt, units)
 
@@ -211,8 +211,8 @@ class _Recorder:
         rows = rows[:: max(1, len(rows) // FRAMES)]
         if not len(rows):
             return
-        sticks, look = self.body.sticks(states[rows]), {"colors": COLOURS[colour]}
-        columns = rr.LineStrips3D.columns(strips=sticks.reshape(-1, 2, 3))
+        sticks, look = self.body.sticks(states[rows]), dict[str, Any](colors=COLOURS[colour])
+        columns = rr.LineStrips3D.columns(strips=[*sticks.reshape(-1, 2, 3)])
         columns = columns.partition([sticks.shape[1]] * len(rows))
         self.log(f"{at}/body", rr.LineStrips3D.from_fields(**look, radii=rr.Radius.ui_points(2)))
         if not sticks.size:

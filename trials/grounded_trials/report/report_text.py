@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from grounded.errors import NextCommand
 from grounded.search.pictures import few
 from grounded_trials.report.findings import Findings
-from grounded_trials.report.tables import about, counted, error_table, forecast_table, improved
+from grounded_trials.report.tables import about, counted, error_table, improved
 from grounded_trials.wording import folded, rendered, wrapped
 from grounded_trials.workspace.next_step import DIAGNOSE
 
@@ -43,9 +43,8 @@ def report_text(findings: Findings, table: Table, bars: Callable[[Sequence[float
     lines += _indented([f"{now.outcome}: {findings.outlook}"])
 
     # errors by state, and what was diagnosed
-    ahead = forecast_table(findings) if findings.logs else []
-    for block in (*error_table(findings), *ahead):
-        lines += ["", block.text or table(block.rows, [name.strip() for name in block.header])]
+    for block in error_table(findings):
+        lines += ["", table(block.rows, block.header)]
     gap = findings.lines or [rendered(DIAGNOSE, findings.folder)]
     lines += ["", "gap to the model", *_indented(gap)]
     if (said := findings.told) is not None and said.rows:

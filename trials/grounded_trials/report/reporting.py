@@ -35,8 +35,7 @@ class Report(Result):
 
     def summary(self) -> str:
         """Return the number of trials and the files."""
-        trials = len(self.findings.runs) + self.findings.left_runs
-        return ", ".join([f"{trials} trials", *map(str, self.paths)])
+        return ", ".join([f"{len(self.findings.runs)} trials", *map(str, self.paths)])
 
     def _repr_html_(self) -> str:
         """Return the candidates, the diagnosis in three lines and the next command as HTML."""
@@ -87,7 +86,7 @@ def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
         "prediction_error": rms(off_prediction(findings, run)),
         "bias_rate": rms(run.residual) / task.dt,
     }
-    return {"candidate": run.candidate.id, "utility": run.utility} | {
+    return {"candidate": run.candidate.id, "utility": findings.tried_of(run).utility} | {
         name: dict(zip(task.model.state_names, map(float, values), strict=True))
         for name, values in measures.items()
     }

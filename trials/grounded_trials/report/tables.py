@@ -33,11 +33,9 @@ from grounded_trials.report.findings import (
     off_target,
     rms,
 )
-from grounded_trials.report.forecast import forecast_error
 from grounded_trials.wording import (
     count,
     figure,
-    labelled,
     legend,
     or_zero,
     rendered,
@@ -101,19 +99,13 @@ def about(findings: Findings) -> str:
 
 
 def counted(findings: Findings) -> list[str]:
-    """Return how many trials there are, and what of them is not used or drawn."""
-    now, logs = findings.standing, len(findings.logs) + findings.left_logs
+    """Return how many trials there are, and which ended early."""
+    now, logs = findings.standing, len(findings.logs)
     found = []
     if findings.history or not logs:
         found.append(f"{count(now.trials, 'trial')}, {count(now.iteration, 'improvement')}")
     if logs:
         found.append(f"{count(logs, 'log')} of data")
-    for left, drawn, kind in (
-        (findings.left_runs, len(findings.runs), "trials"),
-        (findings.left_logs, len(findings.logs), "logs"),
-    ):
-        if left:
-            found.append(f"{drawn} of {left + drawn} {kind} drawn")
     early = [run.trial.id for run in findings.runs if crash(run) is not None]
     return [*found, f"ended early: {', '.join(early)}"] if early else found
 
@@ -137,17 +129,17 @@ def improved(findings: Findings) -> list[tuple[str, str]]:
                 rows.append((" -> ".join(texts), f"{what} off target, {kind}{note}"))
 
     # the utility
-    first, best = findings.first, findings.best
-    if first is not None and best is not None and figure(first.utility) != figure(best.utility):
-        gain, tried = "", {one.candidate.id: one for one in findings.history}
-        if -math.inf < first.utility < 0 and best.utility <= 0:
-            two = tried[first.candidate.id], tried[best.candidate.id]
-            gain = f": {Difference(*two, findings.history).lead.sentence}"
-        moved = f"{figure(first.utility)} -> {figure(best.utility)}"
-        rows.append((moved, f"utility, {first.candidate.id} to {best.candidate.id}{gain}"))
-    elif best is not None:
-        rows.append((figure(best.utility), f"utility, {best.candidate.id}"))
-    return rows
+    tried = [findings.tried_of(run) for _, run in compared(findings)]
+    if findings.best is None:
+        return rows
+    first, best = tried[0].utility, tried[-1].utility
+    names = [one.candidate.id for one in tried]
+    if figure(first) == figure(best):
+        return [*rows, (figure(best), f"utility, {names[-1]}")]
+    gain = ""
+    if -math.inf < first < 0 and best <= 0:
+        gain = f": {Difference(tried[0], tried[-1], findings.history).lead.sentence}"
+    return [*rows, (f"{figure(first)} -> {figure(best)}", f"utility, {' to '.join(names)}{gain}")]
 
 
 # sections
@@ -186,7 +178,6 @@ def _gap(findings: Findings) -> list[Block]:
     """Errors of predictions, forecasts of the crude model beside the better one; then details."""
     diagnosis = findings.diagnosis
     ahead = [b for each in forecast_figures(findings) for b in _drawn(each, title=True)]
-    ahead += forecast_table(findings)
     lacking = [b for each in residual_figures(findings) for b in _drawn(each, title=True)]
     if diagnosis is None:
         command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
@@ -246,28 +237,6 @@ def error_table(findings: Findings) -> list[Block]:
         )
     ]
     return [table("errors", ("state", "unit", *columns), rows)]
-
-
-def forecast_table(findings: Findings) -> list[Block]:
-    """Return the rms prediction error at the horizon `ahead_s` in the best run and every log.
-
-    Unlike the errors of the diagnosis, these are not held out. A trial has a row for each model.
-    """
-    run = findings.lately
-    trials = ([run.trial] if run is not None else []) + [log.trial for log in findings.logs]
-    if not trials:
-        return []
-    planners = [(findings.plain, findings.crude)]
-    if findings.better is not None:
-        planners.append((findings.better.name, findings.better.planner))
-    states, ahead = findings.task.model.states, findings.ahead_s
-    rows = [
-        (t.id or t.candidate, words, *(figure(v, 3) for v in forecast_error(p, t, ahead).tolist()))
-        for t in trials
-        for words, p in planners
-    ]
-    header = ("trial", "model ", *(labelled(name, shown(unit)) for name, unit in states.items()))
-    return _titled(f"Prediction error {ahead:.3g} s ahead, rms", "forecasts", rows, header)
 
 
 def parameter_table(findings: Findings) -> list[Block]:

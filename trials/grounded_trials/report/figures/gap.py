@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.figures.figure import Figure, Panel, curve, fitted, legend, panel, without_astray
+from grounded.figures.figure import Figure, Panel, calm_range, curve, fitted, legend, panel
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import reading_order
@@ -29,15 +29,15 @@ LEAST_STEPS = 30  # shortest trial whose residual is drawn
 
 def forecast_figures(findings: Findings) -> list[Figure]:
     """Return forecasts of a run unknown to the diagnosis, else of the best; and of long logs."""
+    drawn: list[tuple[str, str, Run | Log]] = []
+    if (run := forecast_run(findings)) is not None:
+        drawn = [("forecast", run.label, run)]
     longest = sorted(findings.logs, key=lambda log: -log.trial.finite_steps)[:LOGS]
-    drawn = [(f"data-{log.trial.id}", f"data {log.trial.id}", log.trial) for log in longest]
-    run = forecast_run(findings)
-    if run is not None:
-        drawn.insert(0, ("forecast", run.label, run.trial))
+    drawn += [(f"data-{log.trial.id}", f"data {log.trial.id}", log) for log in longest]
     return [
-        _figure(findings, name, f"{RESTARTED} {findings.ahead_s:.3g} s, {of}", trial)
-        for name, of, trial in drawn
-        if trial.finite_steps > 0
+        _figure(findings, name, f"{RESTARTED} {findings.ahead_s:.3g} s, {of}", one)
+        for name, of, one in drawn
+        if one.trial.finite_steps > 0
     ]
 
 
@@ -48,55 +48,51 @@ def forecast_run(findings: Findings) -> Run | None:
     return fresh[-1] if fresh else findings.lately
 
 
-def _figure(findings: Findings, name: str, title: str, trial: Trial) -> Figure:
-    steps, (trial, begin) = trial.finite_steps, _worst_part(findings, trial)
-    crude, better = forecast(findings.crude, trial, findings.ahead_s), findings.better
-    after = None if better is None else forecast(better.planner, trial, findings.ahead_s)
-    assert crude is not None
+def _figure(findings: Findings, name: str, title: str, of: Run | Log) -> Figure:
+    trial, begin = _worst_part(of)
+    models = [("model", findings.plain, forecast(findings.crude, trial, findings.ahead_s))]
+    if (better := findings.better) is not None:
+        ahead = forecast(better.planner, trial, findings.ahead_s)
+        models.append(("best", f"model {better.name}", ahead))
 
     # a panel for each state
     times = np.arange(trial.steps + 1, dtype=np.float64) * trial.dt + begin
     panels = []
     for i in reading_order(findings.task):
         state, unit = list(findings.task.model.states.items())[i]
-        t, values = crude.curve(i, trial.dt)
-        curves = [
-            curve(times, trial.states[:, i], "real", "real"),
-            curve(t + begin, values, "model", findings.plain, 1.2),
-        ]
-        if better is not None and after is not None:
-            t, values = after.curve(i, trial.dt)
-            curves.append(curve(t + begin, values, "best", f"model {better.name}", 1.2))
-        bounds = fitted(without_astray([curves[0]["y"]], [c["y"] for c in curves[1:]]))
-        label, note = labelled(state, unit), ESTIMATED * (state in findings.estimated)
-        drawn = panel(
-            label, "time [s]", shown(unit), curves, y_range=bounds, note=note, kind="forecast"
+        real = curve(times, trial.states[:, i], "real", "real")
+        made = [curve(t + begin, x[:, i], role, words, 1.2) for role, words, (t, x) in models]
+        panels.append(
+            panel(
+                labelled(state, unit),
+                "time [s]",
+                shown(unit),
+                [real, *made],
+                y_range=calm_range([real["y"]], [one["y"] for one in made]),
+                note=ESTIMATED * (state in findings.estimated),
+                kind="forecast",
+            )
         )
-        panels.append(drawn)
 
     # what of which trial is drawn
-    said, made = [], findings.diagnosis.made if findings.diagnosis is not None else None
-    if made is not None and better is not None and trial.id not in made.trials:
+    said, used = [], findings.diagnosis.made if findings.diagnosis is not None else None
+    if used is not None and better is not None and trial.id not in used.trials:
         said.append("held out")
-    if trial.steps < steps:
+    if trial.steps < of.trial.finite_steps:
         said.append(f"{begin:.4g} to {begin + trial.steps * trial.dt:.4g} s")
     return Figure(name, title, ", ".join(said), panels, legend(panels))
 
 
-def _worst_part(findings: Findings, trial: Trial) -> tuple[Trial, float]:
-    """Return the SPAN_S of a long trial with the largest forecast errors, and its start [s]."""
-    whole, span, first = trial.finite_steps, round(SPAN_S / trial.dt), 0
-    found = forecast(findings.crude, trial, findings.ahead_s) if whole > span else None
-    if found is not None:
-        ends = found.steps[found.steps[:, -1] >= 0, -1]
-        off = findings.task.model.difference(found.states[: len(ends), -1], trial.states[ends])
-        size = np.nan_to_num((off / (np.std(trial.states[: whole + 1], axis=0) + 1e-12)) ** 2)
-        windows = max(1, round(SPAN_S / findings.ahead_s))
-        sums = np.convolve(np.minimum(size.sum(axis=1), 100.0), np.ones(windows), mode="valid")
-        first = max(0, min(int(found.steps[int(np.argmax(sums)), 0]), whole - span))
-    last = min(first + span, whole)
+def _worst_part(of: Run | Log) -> tuple[Trial, float]:
+    """Return the SPAN_S of a long trial with the largest residuals, and its start [s]."""
+    trial, whole = of.trial, of.trial.finite_steps
+    span, first = min(round(SPAN_S / trial.dt), whole), 0
+    if span < whole:
+        spread = np.std(trial.states[: whole + 1], axis=0) + 1e-12
+        size = np.cumsum(np.sum((of.residual[:whole] / spread) ** 2, axis=1))
+        first = int(np.argmax(size[span:] - size[:-span])) + 1
     held = trial.start_inputs if first == 0 else trial.inputs[first - 1]
-    states, inputs = trial.states[first : last + 1], trial.inputs[first:last]
+    states, inputs = trial.states[first : first + span + 1], trial.inputs[first : first + span]
     return replace(trial, states=states, inputs=inputs, start_inputs=held), first * trial.dt
 
 

@@ -1,4 +1,4 @@
-"""Figures of paths: the runs in the plane, and deviations enlarged.
+"""Figures of paths: the runs in the plane.
 
 A mechanism without a position in the plane is drawn from the side, with the path of its end.
 """
@@ -14,10 +14,8 @@ from grounded.figures.figure import (
     WIDTHS,
     Dot,
     Figure,
-    Panel,
     Trace,
     curve,
-    enlarging,
     legend,
     panel,
 )
@@ -29,7 +27,6 @@ from grounded_trials.wording import labelled
 
 OTHERS = 60  # largest number of runs drawn behind the compared ones
 LOG_ROLES = ("best", "model", "accepted", "limit")  # of the latest logs, if there is no run
-SEEN = 5.0  # smallest factor at which enlarged deviations are drawn
 
 
 class View(NamedTuple):
@@ -71,7 +68,7 @@ def _plane(scene: Scene, axis: int) -> View:
 
 
 def path_figure(findings: Findings) -> Figure | None:
-    """Return the figure of the paths and of the enlarged deviations."""
+    """Return the figure of the paths."""
     scene = scene_of(findings.task.model)
     views, drawn = _views(findings, scene), _drawn(findings)
     if sum(one.style == "line" for one in drawn) < (2 if findings.runs or not findings.logs else 1):
@@ -83,8 +80,6 @@ def path_figure(findings: Findings) -> Figure | None:
         panels.append(
             panel(view.title, *view.names, curves, crosses, equal=view.equal, kind="path")
         )
-    if views[0].equal and findings.runs:
-        panels += _enlarged(findings, views[0])
     if not scene.spatial and not views[0].equal:
         caption.append(f"Phase plane of {listed(scene.names)}.")
     if any(crash(run) for run in findings.runs):
@@ -104,7 +99,7 @@ def _drawn(findings: Findings) -> list[Drawn]:
     if not findings.runs and logs:
         return logs
     dt, best = findings.task.dt, compared(findings)
-    ids = {run.trial.id for _, run in best}  # means of several runs have no id
+    ids = {run.trial.id for _, run in best}
     others = [r for r in findings.runs if r.trial.id not in ids][-OTHERS:]
     runs = [("other", r.label, r) for r in others] + [(o, name_of(o, r), r) for o, r in best]
     drawn = [Drawn(r.trial.states, dt, role, name, r.trial.id) for role, name, r in runs]
@@ -161,20 +156,3 @@ def _crash_mark(run: Run, view: View) -> Sequence[Dot]:
     x, y = (float(v) for v in view.place(run.trial.states[[last]])[0])
     known = np.isfinite(x + y)
     return [Dot(x, y, "model", ended(run), "cross", trial=run.trial.id)] if known else []
-
-
-def _enlarged(findings: Findings, view: View) -> list[Panel]:
-    """Draw the best path with enlarged deviations, if these are too small to see."""
-    (role, run), desired = compared(findings)[-1], view.place(findings.task.target)
-    path = view.place(run.trial.states)
-    factor = enlarging(path, desired) if np.isfinite(desired).all() else 0.0
-    if factor < SEEN:
-        return []
-    near = desired[: len(path)]
-    x, y = (near + factor * (path - near)).T
-    width = WIDTHS.get(role, 1.5)
-    curves = [curve(x, y, role, name_of(role, run), width)]
-    x, y = desired.T
-    curves.append(curve(x, y, "desired", "desired", WIDTHS["desired"]))
-    title = f"Deviations {factor:g} times enlarged"
-    return [panel(title, *view.names, curves, equal=True, kind="path")]

@@ -14,12 +14,11 @@ from grounded.figures.figure import (
     Key,
     Panel,
     Trace,
+    calm_range,
     curve,
-    fitted,
     legend,
     panel,
     rule,
-    without_astray,
 )
 from grounded.frozen import Array
 from grounded.result import listed
@@ -35,15 +34,12 @@ from grounded_trials.report.findings import (
     prediction_error,
     selection,
 )
-from grounded_trials.wording import figure, labelled, per_second, shown, with_unit
+from grounded_trials.wording import figure, labelled, per_second, shown
 from grounded_trials.workspace.off_target import asked_for, tracked, tracking_error
 
-FLAT = 0.2  # share of the limits' range below which inputs are drawn without the limits
-CUT = 5.0  # the axis is shortened only if all values span more than this times the calm ones
 DESIRED_END = "desired at the end"  # of a state that only `terminal` weighs
 ITERATIONS = 5  # largest number of iterations whose bias is drawn
-WINDOWS = 60  # means of a calmed curve
-ROUGH = 1.0  # ratio of the change from step to step to the values (rms) from which noise prevails
+MOST_MEANS = 100  # means of a noisy curve
 
 
 def all_figures(findings: Findings) -> list[Figure]:
@@ -111,14 +107,14 @@ def error_figure(findings: Findings) -> Figure | None:
 
         curves, marks = _compared(findings, distance, 0)
         name, unit = "distance from the desired position", list(task.model.states.values())[axes[0]]
-        panels.append(_timed(name, unit, curves, spare=50.0, marks=marks))
+        panels.append(_timed(name, unit, curves, most=50.0, marks=marks))
     for i in (i for i in reading_order(task) if i in asked_for(task)):
         name, unit = list(task.model.states.items())[i]
         curves, marks = _compared(findings, lambda run: tracking_error(task, run.trial), i)
         _, run = shown[-1]
         gap, words = prediction_error(task, run)[:, i], f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
-        panels.append(_timed(f"{name} − target", unit, curves, spare=50.0, marks=marks))
+        panels.append(_timed(f"{name} − target", unit, curves, most=50.0, marks=marks))
     return Figure("error", "Tracking error", "", panels, legend(panels))
 
 
@@ -132,11 +128,7 @@ def input_figure(findings: Findings) -> Figure | None:
             findings, lambda run: np.vstack([run.trial.inputs, run.trial.inputs[-1:]]), j, "steps"
         )
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
-        sent, note = [each["y"] for each in curves], ""
-        if np.ptp(fitted(sent)) < FLAT * np.ptp(fitted([*sent, np.array(limits)])):
-            ends = listed(f"{v:g}" for v in limits).replace("-", "−")
-            note, limits = f"limit{'s' * (len(limits) > 1)} {with_unit(ends, unit)}", []
-        panels.append(_timed(name, unit, curves, limits, note=note))
+        panels.append(_timed(name, unit, curves, limits))
     return Figure("inputs", "Inputs", "", panels, legend(panels))
 
 
@@ -153,16 +145,15 @@ def bias_figure(findings: Findings) -> Figure | None:
     ]
     if best is not None and best.explained is not None and findings.better is not None:
         drawn.append((best.explained, "predicted", f"model {findings.better.name}", 1.5))
-    panels = []
+    panels, window = [], window_of(max(len(values) for values, *_ in drawn))
+    middle = 0.5 * (window - 1) * task.dt  # of the steps of a mean
+    note = f"means: {window * task.dt:.2g} s" * (window > 1)
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
-        window = window_of([values[:, i] for values, *_ in drawn])
-        middle = 0.5 * (window - 1) * task.dt  # of the steps of a mean
         curves = []
         for values, role, words, width in drawn:
             mean = averaged(values[:, i] / task.dt, window)
             curves.append(_over_time(mean, window * task.dt, role, words, width, middle))
-        note = f"means: {window * task.dt:.2g} s" * (window > 1)
         panels.append(_timed(name, per_second(unit), curves, note=note))
     return Figure("bias", "Bias", "", panels, legend(panels))
 
@@ -185,23 +176,20 @@ def _timed(
     unit: str,
     curves: Sequence[Trace],
     limits: Sequence[float] = (),
-    spare: float = 3.0,
+    most: float = 5.0,
     marks: Sequence[Dot] = (),
     note: str = "",
 ) -> Panel:
-    """Return a panel over time, scaled so that a diverging first run does not flatten the others.
+    """Return a panel over time, scaled by `calm_range` around all but the model's own policy.
 
-    If that run is cut off, its note states the values that it reaches.
+    If that run is cut off, or a limit is, the note states what lies outside.
     """
     asked = [dot.y for dot in marks if dot.role == "desired"]
-    calm = [c["y"] for c in curves if c["meta"]["role"] != "model"] + [np.array([*limits, *asked])]
+    calm = [c["y"] for c in curves if c["meta"]["role"] != "model"] + [np.array(asked)]
     wild = [c["y"] for c in curves if c["meta"]["role"] == "model"]
-    finite = [v[np.isfinite(v)] for v in calm]
-    moves = any(len(v) and v.max() > v.min() for v in finite)  # else: a constant target
-    low, high = fitted(without_astray(calm, wild, spare) if moves else [*calm, *wild])
-    all_low, all_high = fitted([*calm, *wild])
-    if all_high - all_low <= CUT * (high - low):
-        low, high = all_low, all_high
+    within = np.array(calm_range(calm, wild, most))
+    low, high = calm_range([within], [np.array(limits)]) if limits else within.tolist()
+    beyond = _outside(wild, low, high, "up to"), _outside([np.array(limits)], low, high, "limits")
     return panel(
         labelled(name, unit),
         "time [s]",
@@ -210,43 +198,28 @@ def _timed(
         marks,
         [rule(v, "limit", "limit") for v in limits],
         y_range=(low, high),
-        note="; ".join(filter(None, (_cut_off(wild, low, high), note))),
+        note="; ".join(filter(None, (*beyond, note))),
         kind="time",
     )
 
 
-def _cut_off(values: list[Array], low: float, high: float) -> str:
+def _outside(values: list[Array], low: float, high: float, words: str) -> str:
     """Return a note with the extreme values outside the picture, "" if all are inside."""
     finite = [v[np.isfinite(v)] for v in values]
-    ends = [float(e) for v in finite if len(v) for e in (v.min(), v.max())]
-    out = sorted({e for e in ends if not low <= e <= high})
-    reached = " and ".join(figure(e, 2) for e in out).replace("-", "−")
-    return f"up to {reached}" if out else ""
+    ends = {float(e) for v in finite if len(v) for e in (v.min(), v.max())}
+    out = [figure(e, 2).replace("-", "−") for e in sorted(ends) if not low <= e <= high]
+    return f"{words} {listed(out)}" if out else ""
 
 
-def window_of(curves: Sequence[Array]) -> int:
-    """Return over how many steps to average curves that share a panel; 1 if they are calm.
+def window_of(steps: int) -> int:
+    """Return over how many steps residuals are averaged, so that about `MOST_MEANS` are drawn.
 
-    A residual divided by dt multiplies a sensor's noise by 1/dt: at 50 Hz, 5 mm is 0.35 m/s. White
-    noise changes from step to step by sqrt(2) times its rms, the course of a system by less.
-
-    Args:
-        curves: values (T,) at equal intervals, in one unit; NaN where unknown.
+    A residual divided by dt multiplies a sensor's noise by 1/dt: at 50 Hz, 5 mm is 0.35 m/s.
     """
-    known = [values[np.isfinite(values)] for values in curves]
-    long = max((len(values) for values in known), default=0)
-    if long < 2 * WINDOWS:
-        return 1
-    size = max(_rms(values) for values in known)
-    change = max(_rms(np.diff(values)) for values in known)
-    return -(-long // WINDOWS) if change > ROUGH * size else 1
+    return max(1, steps // MOST_MEANS)
 
 
 def averaged(values: Array, window: int) -> Array:
     """Return means (T // window, ...) over consecutive steps."""
     whole = values[: len(values) // window * window]
     return np.asarray(whole.reshape(-1, window, *values.shape[1:]).mean(axis=1))
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2))) if len(values) else 0.0
