@@ -14,20 +14,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 
+from grounded.engine import Engine
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Running, StudyTable, improvement, mean_text, run_study
+from grounded.experiments.jobs import Progress, StudyTable, improvement, mean_text, run_study
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
-from grounded.plant import Noise, Plant
+from grounded.plant import Plant
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
 from grounded.search.step_size import SearchOptions
-from grounded.task import Task
 from grounded.trial import Trial
 
 PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}
@@ -97,7 +97,8 @@ def run(
     seeds: Sequence[int] = range(4),
     *,
     manoeuvres: Sequence[str] = NAMES,
-    **how: Unpack[Running],
+    engine: Engine | None = None,
+    progress: Progress | None = None,
 ) -> CarResult:
     """Run every manoeuvre once without scatter, and with scatter once for each seed."""
     cases = (
@@ -106,72 +107,39 @@ def run(
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
     )
-    return CarResult(run_study(CarRun, car_job, cases, **how))
-
-
-@dataclass(frozen=True, eq=False)
-class CarCase:
-    """The task with the crude model, the same with the real car and its latency, and that car."""
-
-    task: Task
-    truth: Task
-    plant: Plant
-    seed: int
-
-    def run(self, policy: Policy, *stream: int) -> Trial:
-        """Run a policy on the real car, with the random numbers of a stream."""
-        start = dict(zip(car.state_names, map(float, self.task.start), strict=True))
-        return self.plant.run(policy, start, np.random.default_rng(list(stream)))
-
-    def optimum(self) -> Policy:
-        """Return the best policy of a search that plans with the real car, without scatter."""
-        quiet = replace(self.plant, noise=Noise())
-        options = SearchOptions(step="full", max_trials=30, max_halvings=6)
-        best = learn(self.truth, replace(self, plant=quiet).first, options, check=False).best
-        assert best is not None
-        return best.candidate.policy
-
-    def first(self, candidate: Candidate) -> Trial:
-        """Run a candidate as the first one."""
-        return self.run(candidate.policy, self.seed, 11, 0)
-
-    def true_utility(self, policy: Policy, runs: int) -> float:
-        """Return the mean utility of fresh runs; a crash counts as a car that never moved."""
-        error = self.task.model.difference(
-            np.tile(self.task.start, (self.task.horizon + 1, 1)), self.task.target
-        )
-        still = -float((np.nan_to_num(error) ** 2 @ self.task.reward.state).sum())
-        fresh = [self.task.utility(self.run(policy, self.seed, 7, i)) for i in range(runs)]
-        return float(np.mean(np.maximum(fresh, still)))
-
-
-def car_case(manoeuvre: str, seed: int, noisy: bool) -> CarCase:
-    """Return a case with the simulated real car as declared."""
-    task = car_task(manoeuvre, car)
-    latency = np.array([LATENCY[name] for name in car.input_names])
-    truth = replace(task.with_model(real_car()), latency=latency)
-    return CarCase(task, truth, real_plant(noisy), seed)
+    return CarResult(run_study(CarRun, car_job, cases, engine, progress))
 
 
 def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
     """Run one job: one repetition of one manoeuvre."""
-    case = car_case(manoeuvre, seed, noisy)
-    options = SearchOptions(max_trials=BUDGET)
-    trials: list[Trial] = []
+    task, plant, trials = car_task(manoeuvre, car), real_plant(noisy), list[Trial]()
+    start = dict(zip(car.state_names, map(float, task.start), strict=True))
+
+    def driven(plant: Plant, policy: Policy, *stream: int) -> Trial:
+        return plant.run(policy, start, np.random.default_rng([seed, *stream]))
 
     def real(candidate: Candidate) -> Trial:
-        trials.append(case.run(candidate.policy, seed, 11, len(trials)))
+        trials.append(driven(plant, candidate.policy, 11, len(trials)))
         return trials[-1]
 
-    found = learn(case.task, real, options, max_iterations=ITERATIONS, check=False)
-    standing = found.standing
-    kept = [tried for tried in standing.history if tried.accepted]
-    fresh = FRESH if noisy else 1
-    true = [
-        case.true_utility(policy, fresh)
-        for policy in (kept[0].candidate.policy, kept[-1].candidate.policy, case.optimum())
-    ]
-    utilities, alphas = tuple(standing.utilities), tuple(c.alpha for c in found.candidates)
+    options = SearchOptions(max_trials=BUDGET)
+    found = learn(task, real, options, max_iterations=ITERATIONS, check=False)
+    # The optimum: a search that plans with the real car and its latency, without scatter.
+    latency = np.array([LATENCY[name] for name in car.input_names])
+    truth, quiet = replace(task.with_model(real_car()), latency=latency), real_plant()
+    options = SearchOptions(step="full", max_trials=30, max_halvings=6)
+    best = learn(truth, lambda one: driven(quiet, one.policy, 11, 0), options, check=False).best
+    assert best is not None
+    # The true utility: the mean of fresh runs. A crash counts as a car that never moved.
+    error = car.difference(np.tile(task.start, (task.horizon + 1, 1)), task.target)
+    still = -float((np.nan_to_num(error) ** 2 @ task.reward.state).sum())
+    kept = [tried.candidate for tried in found.standing.history if tried.accepted]
+    true = []
+    for candidate in (kept[0], kept[-1], best.candidate):
+        runs = range(FRESH if noisy else 1)
+        fresh = [task.utility(driven(plant, candidate.policy, 7, i)) for i in runs]
+        true.append(float(np.mean(np.maximum(fresh, still))))
+    utilities, alphas = tuple(found.standing.utilities), tuple(c.alpha for c in found.candidates)
     first, last, top = true
     run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas)
     return vars(CarRun(*run))

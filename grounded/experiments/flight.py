@@ -13,14 +13,16 @@ parameters, which the search never sees.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Unpack
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from grounded.checks import wrong
+from grounded.engine import Engine
 from grounded.experiments.figure8 import RADIUS, flight_task, perturbed
 from grounded.experiments.jobs import (
-    Running,
+    Progress,
     StudyTable,
     improvement,
     mean_se,
@@ -29,7 +31,7 @@ from grounded.experiments.jobs import (
 )
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
-from grounded.result import plain
+from grounded.result import document, plain
 from grounded.rollout import simulate
 from grounded.search.ask_tell import learn
 from grounded.search.candidate import Candidate
@@ -77,38 +79,30 @@ class FlightResult:
         """The runs that were not discarded."""
         return tuple(run for run in self.runs if not run.discarded)
 
-    def summary(self) -> dict[str, Any]:
-        """Return the figures of Table 1."""
-        first = [run.utilities[0] for run in self.flown]
-        last = [run.utilities[-1] for run in self.flown]
-        mean, se = mean_se([run.improvement for run in self.flown])
-        return {
-            "model_based": mean_se(first),
-            "learned": mean_se(last),
-            "optimum": self.optimum,
-            "worst_gap_to_optimum": max((self.optimum - u) / -self.optimum for u in last),
-            "improvement": {
-                "mean": mean,
-                "se": se,
-                "ratio_of_means": improvement(float(np.mean(first)), float(np.mean(last))),
-            },
-            "trials": mean_se([run.trials for run in self.flown])[0],
-            "trials_an_iteration": float(
-                np.mean([(run.trials - 1) / max(len(run.utilities) - 1, 1) for run in self.flown])
-            ),
-            "discarded": len(self.runs) - len(self.flown),
-        }
-
     def to_json(self) -> dict[str, Any]:
         """Return the document of `grounded experiment flight --json`: a row per run, and means."""
-        runs = [vars(run) | {"optimum": self.optimum} for run in self.runs]
-        return dict(plain({"runs": runs, **self.summary(), "paper": PAPER}))
+        flown = self.flown
+        first, last = ([run.utilities[k] for run in flown] for k in (0, -1))
+        mean, se = mean_se([run.improvement for run in flown])
+        ratio = improvement(float(np.mean(first)), float(np.mean(last)))
+        each = [(run.trials - 1) / max(len(run.utilities) - 1, 1) for run in flown]
+        return document(
+            runs=[vars(run) | {"optimum": self.optimum} for run in self.runs],
+            model_based=mean_se(first),
+            learned=mean_se(last),
+            optimum=self.optimum,
+            worst_gap_to_optimum=max((self.optimum - u) / -self.optimum for u in last),
+            improvement={"mean": mean, "se": se, "ratio_of_means": ratio},
+            trials=float(np.mean([run.trials for run in flown])),
+            trials_an_iteration=float(np.mean(each)),
+            discarded=len(self.runs) - len(flown),
+            paper=PAPER,
+        )
 
     def tables(self) -> list[StudyTable]:
         """Return Table 1 beside the paper's."""
-        found = self.summary()
-        first = mean_text([run.utilities[0] for run in self.flown], ",.0f", ",.0f")
-        last = mean_text([run.utilities[-1] for run in self.flown], ",.0f", ",.0f")
+        found = self.to_json()
+        first, last = (mean_text([run.utilities[k] for run in self.flown], ",.0f") for k in (0, -1))
         gain = mean_text([run.improvement for run in self.flown])
         rows = (
             ("utility, model-based", first, "-13,028 (±330)"),
@@ -130,34 +124,29 @@ def run(
     count: int = 10,
     *,
     first_seed: int = 0,
-    **how: Unpack[Running],
+    engine: Engine | None = None,
+    progress: Progress | None = None,
 ) -> FlightResult:
     """Make Table 1 from `count` runs that are not discarded, seeds first_seed, first_seed + 1 ...
 
     Args:
         count: number of runs, without discarded ones.
         first_seed: first seed of the approximate models.
-        how: where the jobs run, see `run_jobs`.
+        engine: where the jobs run, see `run_jobs`.
+        progress: see `run_jobs`.
 
     Raises:
         GroundedError: if more than four of five models are discarded.
     """
     found: list[FlightRun] = []
-    seed = first_seed
-    while sum(not r.discarded for r in found) < count:
+    while missing := count - sum(not r.discarded for r in found):
         if len(found) >= 5 * count:
             raise wrong("flyable models", len(found), low=count)
-        missing = count - sum(not r.discarded for r in found)
+        seed = first_seed + len(found)
         cases = ({"seed": s} for s in range(seed, seed + missing))
-        found += run_study(FlightRun, flight_job, cases, **how)
-        seed += missing
-    return FlightResult(tuple(found), flight_optimum())
-
-
-def flight_optimum() -> float:
-    """Return the utility of DDP with the true parameters."""
-    _, result = first_policy(flight_task(aircraft))
-    return -result.cost
+        found += run_study(FlightRun, flight_job, cases, engine, progress)
+    _, optimum = first_policy(flight_task(aircraft))
+    return FlightResult(tuple(found), -optimum.cost)
 
 
 def flight_job(seed: int) -> dict[str, Any]:
@@ -167,15 +156,11 @@ def flight_job(seed: int) -> dict[str, Any]:
     task = flight_task(crude, started_by=aircraft)
     options = SearchOptions()
     first = propose(task, [], [], options).candidate
-    if first is None or unstable(truth, flown := real_flight(truth, first)):
-        if first is None:
-            return vars(FlightRun(seed, True, (), 1, (1.0,)))
-        claimed = plain([truth.utility(flown)])  # JSON has no infinity
+    flown = None if first is None else real_flight(truth, first)
+    if flown is None or unstable(truth, flown):
+        claimed = plain([truth.utility(flown)] if flown else [])  # JSON has no infinity
         return vars(FlightRun(seed, True, claimed, 1, (1.0,)))
-
-    def fly(candidate: Candidate) -> Trial:
-        return real_flight(truth, candidate)
-
+    fly = partial(real_flight, truth)
     found = learn(task, fly, options, max_iterations=ITERATIONS, check=False)
     alphas = tuple(c.alpha for c in found.candidates)
     utilities = tuple(found.standing.utilities)
@@ -187,14 +172,9 @@ def real_flight(truth: Task, candidate: Candidate) -> Trial:
     flown = simulate(truth.problem(exact=True), candidate.policy)
     good = np.isfinite(flown.states).all(axis=1) & (np.abs(flown.states) < 1e6).all(axis=1)
     T = truth.horizon if good.all() else max(int(np.argmin(good)) - 1, 0)
-    return Trial(
-        states=flown.states[: T + 1],
-        inputs=flown.inputs[:T],
-        dt=truth.dt,
-        state_names=truth.model.state_names,
-        input_names=truth.model.input_names,
-        start_inputs=truth.past,
-    )
+    names = truth.model.state_names, truth.model.input_names
+    states, inputs = flown.states[: T + 1], flown.inputs[:T]
+    return Trial(states, inputs, truth.dt, *names, start_inputs=truth.past)
 
 
 def unstable(truth: Task, flight: Trial) -> bool:

@@ -54,36 +54,31 @@ class Footnote9Result:
         """Return the shares of the optimum by b."""
         head = ("b", "model-based", "one iteration (trials)")
         rows = tuple(
-            (
-                f"{row.b:g}",
-                f"{row.model_based:.3g}",
-                f"{row.solved:.6f} ({row.solved_trials})",
-            )
-            for row in self.rows
+            (f"{r.b:g}", f"{r.model_based:.3g}", f"{r.solved:.6f} ({r.solved_trials})")
+            for r in self.rows
         )
         return [StudyTable("Footnote 9: utility as a share of the optimum", head, rows)]
 
 
 def run(offsets: Sequence[float] = OFFSETS) -> Footnote9Result:
     """Compare the model's policy and one iteration of the algorithm for each b in `offsets`."""
-    return Footnote9Result(tuple(Footnote9Row(b, math.exp(-(b**2)), *_solved(b)) for b in offsets))
+    return Footnote9Result(tuple(map(_row, offsets)))
 
 
-def _next(s: Any, a: Any, p: Any, dt: float) -> dict[str, Any]:
-    return {"s": a.a + p.b}
-
-
-def footnote9_task(b: float) -> Task:
-    """Return the approximate MDP with the reward -s^2 on the state after one step."""
-    model = Model(
-        name="footnote 9", states={"s": "1"}, inputs={"a": "1"}, params={"b": Param(b)}, step=_next
-    )
+def _row(b: float) -> Footnote9Row:
     zero, one = np.zeros(1), np.ones(1)
-    return Task(
+    model = Model(
+        name="footnote 9",
+        states={"s": "1"},
+        inputs={"a": "1"},
+        params={"b": Param(b)},
+        step=lambda s, a, p, dt: {"s": a.a + p.b},
+    )
+    task = Task(
         model=model,
         dt=1.0,
         target=np.zeros((2, 1)),
-        reward=Reward(zero, one, zero, zero),
+        reward=Reward(zero, one, zero, zero),  # -s^2 after the step
         start=zero,
         past=zero,
         low=np.full(1, -1e3),
@@ -91,14 +86,10 @@ def footnote9_task(b: float) -> Task:
         feedback=False,
     )
 
-
-def _solved(b: float) -> tuple[float, int]:
-    """Return the share of the optimum after one iteration, and the number of real trials."""
-    task = footnote9_task(b)
-
     def real(candidate: Candidate) -> Trial:
         a = candidate.policy.feedforward
         return Trial(np.vstack([np.zeros((1, 1)), a]), a, 1.0, ("s",), ("a",))
 
     found = learn(task, real, SearchOptions(step="full"), max_iterations=1, check=False)
-    return math.exp(found.standing.utilities[-1]), len(found.trials)
+    share = math.exp(found.standing.utilities[-1])
+    return Footnote9Row(b, math.exp(-(b**2)), share, len(found.trials))

@@ -22,15 +22,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 
 from grounded.compile import Problem
-from grounded.experiments.jobs import Running, StudyTable, every, loglog_slope, mean_se, run_study
+from grounded.engine import Engine
+from grounded.experiments.jobs import Progress, StudyTable, mean_se, mean_text, run_study
 from grounded.frozen import Array
 from grounded.model import Model, Param
-from grounded.result import plain
+from grounded.result import document
 from grounded.solve.bias import ground
 from grounded.solve.policy_gradient import gradient
 from grounded.task import Task
@@ -66,77 +67,68 @@ class Theorem1Result:
 
     rows: tuple[Theorem1Row, ...]
 
-    def slopes(self) -> dict[str, tuple[float, float]]:
-        """Return slopes of gradient error and squared gradient over epsilon: mean, std error.
+    def slopes(self) -> dict[str, list[float]]:
+        """Return slopes of log gradient error and log squared gradient over log epsilon.
 
         One slope per seed, because K depends on the shape of the model's error.
         """
         found: dict[str, list[float]] = {"gradient_error": [], "squared_gradient": []}
-        for seed in dict.fromkeys(row.seed for row in self.rows):
-            own = [row for row in self.rows if row.seed == seed]
-            x = [row.epsilon for row in own]
-            found["gradient_error"].append(loglog_slope(x, [row.error for row in own]))
-            found["squared_gradient"].append(loglog_slope(x, [row.squared for row in own]))
-        return {name: mean_se(values) for name, values in found.items()}
+        for own in self._by("seed").values():
+            x, error, squared = np.log([(row.epsilon, row.error, row.squared) for row in own]).T
+            for each, y in zip(found.values(), (error, squared), strict=True):
+                each.append(float(np.polyfit(x, y, 1)[0]))
+        return found
+
+    def _by(self, name: str) -> dict[float, list[Theorem1Row]]:
+        found: dict[float, list[Theorem1Row]] = {}
+        for row in self.rows:
+            found.setdefault(getattr(row, name), []).append(row)
+        return found
 
     def to_json(self) -> dict[str, Any]:
         """Return rows and slopes as plain values."""
-        slopes = {k: {"slope": v[0], "se": v[1]} for k, v in self.slopes().items()}
-        worst = max(row.ratio for row in self.rows)
-        paper = {"gradient_error": 1, "squared_gradient": 2}
-        found: dict[str, Any] = {"rows": [vars(r) for r in self.rows], "slopes": slopes}
-        found |= {"largest_ratio_to_bound": worst, "paper": paper}
-        found |= {"K": max(row.K for row in self.rows)}
-        return dict(plain(found))
+        slopes = {name: mean_se(values) for name, values in self.slopes().items()}
+        return document(
+            rows=[vars(row) for row in self.rows],
+            slopes={name: {"slope": mean, "se": se} for name, (mean, se) in slopes.items()},
+            largest_ratio_to_bound=max(row.ratio for row in self.rows),
+            paper={"gradient_error": 1, "squared_gradient": 2},
+            K=max(row.K for row in self.rows),
+        )
 
     def tables(self) -> list[StudyTable]:
         """Return medians by epsilon, and the slopes beside the theorem's."""
-        rows = []
-        for epsilon in dict.fromkeys(row.epsilon for row in self.rows):
-            own = [row for row in self.rows if row.epsilon == epsilon]
-            rows.append(
-                (
-                    f"{epsilon:g}",
-                    f"{np.median([row.error for row in own]):.3g}",
-                    f"{np.median([row.squared for row in own]):.3g}",
-                    f"{max(row.ratio for row in own):.3f}",
-                )
+        rows = tuple(
+            (
+                f"{epsilon:g}",
+                f"{np.median([row.error for row in own]):.3g}",
+                f"{np.median([row.squared for row in own]):.3g}",
+                f"{max(row.ratio for row in own):.3f}",
             )
-        head = (
-            "epsilon",
-            "|grad U - grad U^|",
-            "|grad U|^2 at the end",
-            "share of 2 K^2 epsilon^2, at most",
+            for epsilon, own in self._by("epsilon").items()
         )
-        found = self.slopes()
+        share = "share of 2 K^2 epsilon^2, at most"
+        head = ("epsilon", "|grad U - grad U^|", "|grad U|^2 at the end", share)
         slopes = tuple(
-            (name, _with_error(*found[key]), paper)
-            for name, key, paper in (
-                ("gradient error over epsilon", "gradient_error", "1"),
-                ("squared gradient over epsilon", "squared_gradient", "2"),
-            )
+            (f"{name.replace('_', ' ')} over epsilon", mean_text(values, ".3f"), bound)
+            for (name, values), bound in zip(self.slopes().items(), "12", strict=True)
         )
-        seeds = len(self.rows) // max(len(rows), 1)
-        title = f"Theorem 1: medians of {seeds} seeds" if seeds > 1 else "Theorem 1: one seed"
         return [
-            StudyTable(title, head, tuple(rows)),
+            StudyTable("Theorem 1: medians of the seeds", head, rows),
             StudyTable("Slopes (± one standard error)", ("", "here", "of the bound"), slopes),
         ]
-
-
-def _with_error(value: float, error: float) -> str:
-    return f"{value:.3f} (±{error:.3f})" if math.isfinite(error) else f"{value:.3f}"
 
 
 def run(
     seeds: Sequence[int] = range(8),
     *,
     epsilons: Sequence[float] = EPSILONS,
-    **how: Unpack[Running],
+    engine: Engine | None = None,
+    progress: Progress | None = None,
 ) -> Theorem1Result:
     """Run a search for each epsilon and seed; the seed sets the shape of the model's error."""
-    cases = every(epsilon=map(float, epsilons), seed=seeds)
-    return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, **how))
+    cases = [{"epsilon": float(epsilon), "seed": seed} for epsilon in epsilons for seed in seeds]
+    return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, engine, progress))
 
 
 def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:

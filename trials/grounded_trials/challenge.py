@@ -27,7 +27,7 @@ from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.effects import Library
 from grounded.engine import Engine
 from grounded.errors import GroundedError, NextCommand
-from grounded.experiments.jobs import Job, Progress, run_jobs
+from grounded.experiments.jobs import Progress, run_jobs
 from grounded.findings import found
 from grounded_trials.plain_file import read_file, unreadable
 from grounded_trials.starting.examples import toml_of
@@ -177,15 +177,9 @@ def diagnose_cases(
         GroundedError: if the folder holds no challenge, or a worker dies.
     """
     names = undiagnosed(folder, again=again)
-    jobs = [
-        Job(
-            diagnose_case,
-            {"folder": str(folder.resolve()), "name": name, "without": list(without)},
-        )
-        for name in names
-    ]
+    where = {"folder": str(folder.resolve()), "without": list(without)}
     times = read_times(folder)
-    found = run_jobs(jobs, engine, progress=progress)
+    found = run_jobs(diagnose_case, [where | {"name": n} for n in names], engine, progress)
     times |= {str(one["case"]): float(one["cpu_s"]) for one in found}
     write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True).encode())
     return times
@@ -229,9 +223,9 @@ def score_cases(
     """
     entries = read_manifest(folder)
     where = {"folder": str(folder.resolve()), "labels": str(labels.resolve())}
-    jobs = [Job(score_case, where | {"name": name, "entry": e}) for name, e in entries.items()]
+    cases = [where | {"name": name, "entry": entry} for name, entry in entries.items()]
     times = read_times(folder)
-    marks = run_jobs(jobs, engine, progress=progress)
+    marks = run_jobs(score_case, cases, engine, progress)
     return [m | {"cpu_s": times[m["case"]]} if m["case"] in times else m for m in marks]
 
 
