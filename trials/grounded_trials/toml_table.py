@@ -1,4 +1,4 @@
-"""Reads a TOML table key by key and reports every key that nothing asked for.
+"""Reads a TOML table into dataclasses: each key is checked against the type of its field.
 
 Every error names the file, the key with its table, what was found, and what was expected.
 """
@@ -9,30 +9,26 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import MISSING, fields
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar, cast, get_args, get_origin, get_type_hints
 
 from grounded.checks import near, refused, wrong
-from grounded.errors import GroundedError, NextCommand, alike
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.plain_file import read_file, unreadable
 
 SIZE_LIMIT = 2**22  # [bytes] of a file
-_REQUIRED = object()
+T = TypeVar("T")
 
 
 class Table:
-    """One table of a TOML file; `where` is its dotted name, "" for the whole file.
-
-    Taking a key does not remove it: it can be taken again, for example for a second log.
-    """
+    """One table of a TOML file; `where` is its dotted name, "" for the whole file."""
 
     def __init__(self, values: Mapping[str, Any], file: Path, where: str = "") -> None:
-        self._values = dict(values)
-        self._known: set[str] = set()
-        self._taken: set[str] = set()
-        self.file, self.where = file, where
+        self.values, self.file, self.where = dict(values), file, where
 
     def error(self, key: str, must: str, value: object = None) -> GroundedError:
         """Return an error about one key.
@@ -48,104 +44,98 @@ class Table:
     def _full(self, key: str) -> str:
         return f"[{self.where}] {key}" if self.where else key
 
-    def unknown(self, key: str, valid: Iterable[str], value: str = "") -> GroundedError:
-        """Return an error about a key, or the value of a key, that is none of the valid ones."""
-        if value:
-            facts = near(value, valid)
-            return wrong(self._full(key), got=repr(value), where=self.file.name, **facts)
-        place = {"where": self.file.name, **near(key, valid)}
-        return refused("given.name", self._full(key), kind="key", **place)
+    def expect(self, names: Iterable[str]) -> None:
+        """Raise an error for a key that is not among `names`."""
+        valid = list(names)
+        for key in self.values:
+            if key not in valid:
+                place = {"where": self.file.name, **near(key, valid)}
+                raise refused("given.name", self._full(key), kind="key", **place)
 
-    def expect(self, *names: str) -> None:
-        """Raise an error for a key that is not among `names`; called before any key is taken."""
-        for key in self._values:
-            if key not in names:
-                raise self.unknown(key, names)
+    def take(self, key: str, kind: Any, default: Any = None) -> Any:
+        """Return the value of a key, or the default if it is absent.
 
-    def has(self, key: str) -> bool:
-        """Return whether the key is present."""
-        self._known.add(key)
-        return key in self._values
+        Args:
+            key: of this table.
+            kind: a type (an integer is accepted as a float), one with None, a Literal, or a Mapping
+                of names to numbers.
+            default: its value if the key is absent.
+        """
+        if get_origin(kind) is Mapping:
+            return self.sub(key).numbers()
+        return self._checked(key, self.values[key], kind) if key in self.values else default
 
-    def peek(self, key: str) -> Any:
-        """Return the unchecked value of a key, None if it is absent."""
-        return self._values.get(key)
-
-    def take(self, key: str, kind: type, default: Any = _REQUIRED) -> Any:
-        """Return the value of a key, checked to be of `kind`; an integer is accepted as a float."""
-        self._known.add(key)
-        if key not in self._values:
-            if default is _REQUIRED:
-                close = alike(key, self._values.keys() - self._known)
-                got = repr(close) if close else ""
-                raise wrong(self._full(key), got=got, must="given", where=self.file.name)
-            return default
-        self._taken.add(key)
-        return self._checked(key, self._values[key], kind)
-
-    def _checked(self, key: str, value: Any, kind: type) -> Any:
-        fits = isinstance(value, kind) and not (isinstance(value, bool) and kind is not bool)
-        if kind is float and isinstance(value, int) and not isinstance(value, bool):
-            if abs(value) > 10**300:
-                raise self.error(key, "finite", "over 300 digits")
-            return float(value)
-        if not fits:
+    def _checked(self, key: str, value: Any, kind: Any) -> Any:
+        if type(None) in get_args(kind):
+            kind = get_args(kind)[0]
+        if get_origin(kind) is Literal:
+            text, options = self._checked(key, value, str), get_args(kind)
+            if text not in options:
+                facts = near(text, options)
+                raise wrong(self._full(key), got=repr(text), where=self.file.name, **facts)
+            return text
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        if kind is float and whole and abs(value) > 10**300:
+            raise self.error(key, "finite", "over 300 digits")
+        value = float(value) if kind is float and whole else value
+        if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
             raise self.error(key, kind.__name__, value)
         if kind is float and not math.isfinite(value):
             raise self.error(key, "finite", value)
         return value
 
-    def choice(self, key: str, options: Iterable[str], default: Any = _REQUIRED) -> str:
-        """Return the text of a key, which must be one of the options."""
-        value: str = self.take(key, str, default)
-        names = list(options)
-        if value not in names:
-            raise self.unknown(key, names, value)
-        return value
+    def into(self, kind: type[T], **read: Any) -> T:
+        """Return the table as a dataclass; keys that are none of its fields are errors.
+
+        Args:
+            kind: its fields are of the kinds that `take` knows.
+            **read: values of fields that are read in another way.
+        """
+        types, found = _types(cast(Any, kind)), dict(read)
+        self.expect(types)
+        for name, (of, default) in types.items():
+            if name in read:
+                continue
+            if default is MISSING and name not in self.values and get_origin(of) is not Mapping:
+                raise self.error(name, "given")
+            if name in self.values or default is MISSING:
+                found[name] = self.take(name, of)
+        return kind(**found)
 
     def sub(self, key: str) -> Table:
         """Return the table under a key, empty if it is absent."""
-        self._known.add(key)
-        self._taken.add(key)
-        value = self._values.get(key, {})
+        value = self.values.get(key, {})
         if not isinstance(value, dict):
             raise self.error(key, "dict", value)
         return Table(value, self.file, f"{self.where}.{key}" if self.where else key)
 
-    def numbers(self, key: str, names: Iterable[str]) -> dict[str, float]:
-        """Return the table name -> number under a key; its names must be among `names`."""
-        table, valid = self.sub(key), list(names)
-        values = {name: table.take(name, float) for name in valid if table.has(name)}
-        table.finish(valid)
-        return values
+    def numbers(self, names: Collection[str] | None = None) -> dict[str, float]:
+        """Return this table as name -> number; its names must be among `names`, if given."""
+        self.expect(self.values if names is None else names)
+        return {name: self.take(name, float) for name in names or self.values if name in self}
 
-    def all_numbers(self) -> dict[str, float]:
-        """Return this table as name -> number, with any names."""
-        return {name: self.take(name, float) for name in self.names()}
-
-    def pairs(self, names: Iterable[str]) -> dict[str, tuple[float, float]]:
+    def pairs(self, names: Collection[str]) -> dict[str, tuple[float, float]]:
         """Return this table as name -> (low, high); its names must be among `names`."""
-        valid, pairs = list(names), {}
-        for name in valid:
-            if self.has(name):
-                value = self._values[name]
-                self._taken.add(name)
+        self.expect(names)
+        found = {}
+        for name in names:
+            if name in self:
+                value = self.values[name]
                 if not isinstance(value, list) or len(value) != 2:
                     raise self.error(name, "pair", value)
                 low, high = (self._checked(name, v, float) for v in value)
-                pairs[name] = (low, high)
-        self.finish(valid)
-        return pairs
+                found[name] = (low, high)
+        return found
 
-    def names(self) -> list[str]:
-        """Return all keys."""
-        return list(self._values)
+    def __contains__(self, key: str) -> bool:
+        return key in self.values
 
-    def finish(self, valid: Iterable[str] | None = None) -> None:
-        """Raise an error for a key that was not taken; suggests one of the `valid` names."""
-        for key in self._values.keys() - self._taken:
-            known = self._known if valid is None else valid
-            raise self.unknown(key, sorted(known))
+
+@cache
+def _types(kind: Any) -> dict[str, tuple[Any, Any]]:
+    """Return the type and the default of each field of a dataclass."""
+    hints = get_type_hints(kind)
+    return {one.name: (hints[one.name], one.default) for one in fields(kind)}
 
 
 def read_toml(path: Path) -> Table:

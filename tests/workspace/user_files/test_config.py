@@ -73,7 +73,7 @@ def everything(workspace):
     """All that a command may take from grounded.toml."""
     config, model, task = workspace.config, workspace.base_model, workspace.task
     log_mapping(config.log, model.state_names, model.input_names)
-    if config.estimate.names():
+    if config.estimate.values:
         read_estimate(config.estimate, model)
     if config.system.model:
         simulated_plant(workspace)

@@ -22,7 +22,6 @@ from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
 from grounded_trials.toml_table import Table
 
-CLOCKS = ("header", "log", "publish")
 LATEST_S = 1e-9 * LATEST
 
 
@@ -37,17 +36,18 @@ def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> L
     Raises:
         GroundedError: for an unknown key or name, or a value of the wrong kind.
     """
-    if not table.names():
+    if not table.values:
         return None
-    clock = table.choice("clock", CLOCKS, "header")
+    table.expect(("clock", "state", "input", "span", "columns", "rate"))
+    clock = table.take("clock", Clock, "header")
     signals = {}
     for kind, names in (("state", states), ("input", inputs)):
         group = table.sub(kind)
-        signals[kind] = {name: _signal(group.sub(name), clock) for name in names if group.has(name)}
-        group.finish(names)
-    span, layout = _span(table.sub("span")), layout_of(table)
-    table.finish()
-    return LogMapping(signals["state"], signals["input"], span, layout)
+        group.expect(names)
+        signals[kind] = {name: _signal(group.sub(name), clock) for name in names if name in group}
+    return LogMapping(
+        signals["state"], signals["input"], _span(table.sub("span")), layout_of(table)
+    )
 
 
 def layout_of(table: Table) -> Layout:
@@ -66,72 +66,50 @@ def layout_of(table: Table) -> Layout:
 
 
 def _signal(table: Table, clock: str) -> SignalSpec:
-    age = _time(table, "max_age_s") if table.has("max_age_s") else None
-    how = table.choice("resample", ("linear", "hold", ""), "")
-    spec = SignalSpec(
-        path=_path(table),
-        clock=cast(Clock, table.choice("clock", CLOCKS, clock)),
-        unwrap=table.take("unwrap", bool, False),
-        scale=table.take("scale", float, 1.0),
-        offset=table.take("offset", float, 0.0),
-        delay_s=_time(table, "delay_s") if table.has("delay_s") else 0.0,
-        max_age_s=age,
-        resample=cast('Literal["linear", "hold"] | None', how or None),
-        before=table.take("before", float) if table.has("before") else None,
-    )
-    table.finish()
+    spec = table.into(SignalSpec)
+    _check_path(table, spec.path)
+    _check_time(table, "max_age_s", spec.max_age_s)
+    _check_time(table, "delay_s", spec.delay_s)
     if spec.max_age_s is not None and spec.max_age_s <= 0:
         raise table.error("max_age_s", "positive", spec.max_age_s)
     if spec.scale == 0:
         raise table.error("scale", "nonzero", spec.scale)
-    return spec
+    return spec if "clock" in table else replace(spec, clock=cast(Clock, clock))
 
 
-def _time(table: Table, key: str) -> float:
-    """Return a time [s], of a log's clock at the most: later ones have no whole nanoseconds."""
-    value: float = table.take(key, float)
-    if abs(value) > LATEST_S:
+def _check_time(table: Table, key: str, value: float | None) -> None:
+    """Check a time [s]: beyond a log's clock it has no whole nanoseconds."""
+    if value is not None and abs(value) > LATEST_S:
         raise table.error(key, "time", value)
-    return value
 
 
-def _path(table: Table) -> str:
-    """Return the value of `path`, checked to be a valid message path."""
-    path: str = table.take("path", str)
+def _check_path(table: Table, path: str) -> None:
     try:
         parse_path(path)
     except GroundedError as error:
         raise table.error("path", "path", str(error)) from None
-    return path
 
 
 def _span(table: Table) -> Span:
-    start = _end(table, "start")
-    end = _end(table, "end")
-    table.finish()
+    table.expect(("start", "end"))
+    start, end = _end(table, "start"), _end(table, "end")
     if end == "first-input":
         raise table.error("end", "crossing", end)
-    return Span(start="first-input" if start is None else start, end=cast("Any", end))
+    return Span(start="first-input" if start is None else start, end=end)
 
 
 def _end(table: Table, key: str) -> Any:
     """Parse one end of the span: None, "first-input", a time, or a crossing."""
-    value = table.peek(key)
-    if value is None:
-        table.has(key)
-        return None
-    if isinstance(value, str):
-        return table.choice(key, ("first-input",), "first-input")
+    value = table.values.get(key)
+    if value is None or isinstance(value, str):
+        return table.take(key, Literal["first-input"])
     if not isinstance(value, dict):
-        return _time(table, key)
+        time = table.take(key, float)
+        _check_time(table, key, time)
+        return time
     crossing = table.sub(key)
-    given = Crossing(
-        path=_path(crossing),
-        above=crossing.take("above", float) if crossing.has("above") else None,
-        below=crossing.take("below", float) if crossing.has("below") else None,
-        clock=cast(Clock, crossing.choice("clock", CLOCKS, "log")),
-    )
-    crossing.finish()
+    given = crossing.into(Crossing)
+    _check_path(crossing, given.path)
     if (given.above is None) == (given.below is None):
         raise table.error(key, "crossing", value)
     return given

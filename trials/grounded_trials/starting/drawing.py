@@ -44,7 +44,7 @@ from grounded_trials.workspace.identity import unknown_trial
 from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven
 from grounded_trials.workspace.user_files.config import set_numbers
-from grounded_trials.workspace.user_files.task_file import read_target, seen_in
+from grounded_trials.workspace.user_files.task_file import read_target
 
 
 def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
@@ -303,7 +303,7 @@ def _in_readings(case: _Case) -> Iterator[Finding]:
 
 
 def _of_log(case: _Case) -> Iterator[Finding]:
-    if log := seen_in(case.workspace.config):
+    if log := case.workspace.config.seen_in:
         yield found("plan.limits_of_log", log=log)
     if (lost := unmapped(case.workspace)) is not None:
         yield lost

@@ -111,7 +111,7 @@ class Folder:
     @property
     def log_mapping(self) -> LogMapping | None:
         """Where [log] finds the signals of the model; None without that table."""
-        if not self.config.log.names():
+        if not self.config.log.values:
             return None
         from grounded_trials.logs.log_table import log_mapping
 

@@ -22,7 +22,6 @@ from grounded_trials.workspace.last_diagnosis import (
     usable_ids,
 )
 from grounded_trials.workspace.new_target import PROPOSE, TARGET, to_plan, undrawn
-from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
@@ -178,7 +177,7 @@ def not_ingested(workspace: Folder) -> str:
 
     Its name is known until the user deletes it from [limits]. It is "LOG" if it lies elsewhere.
     """
-    log = "" if workspace.store.list() or workspace.candidate_ids() else seen_in(workspace.config)
+    log = "" if workspace.store.list() or workspace.candidate_ids() else workspace.config.seen_in
     places = (Path(log), workspace.folder.parent / log, workspace.folder / log)
     return next((str(path) for path in places if path.exists()), "LOG") if log else ""
 

@@ -19,7 +19,6 @@ from grounded.task import Task
 from grounded_trials.workspace.candidates.at_rest import held_before
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import tracking_error, weighed_groups
-from grounded_trials.workspace.user_files.task_file import seen_in
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -113,7 +112,7 @@ def without_effect(plan: Plan) -> Iterator[Finding]:
 
 def limits_of_log(plan: Plan) -> Iterator[Finding]:
     """[limits] are only what a log used."""
-    if log := seen_in(plan.workspace.config):
+    if log := plan.workspace.config.seen_in:
         yield found("plan.limits_of_log", log=log)
 
 

@@ -11,10 +11,10 @@ import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any
 
 from grounded.errors import GroundedError
 from grounded.search.step_size import SearchOptions
@@ -26,6 +26,7 @@ OFFER = re.compile(r"(?m)^# terminal = \{.*\}$")
 FILE = "grounded.toml"
 DRIVE = "drive.py"  # the robot's program, as `init` writes it
 UNWRITTEN = "drive.py: complete measure() and send() for your robot"  # in it until the user does
+NOISES = ("start", "process", "measurement")  # of a simulated system
 OFFERED = 10  # terminal weights in the comment that `init` writes, as multiples of `state`
 
 
@@ -72,6 +73,7 @@ class Config:
     task: TaskTable
     reward: Table
     limits: Table
+    seen_in: str  # file name of the log that [limits] were taken from; "" if the user set them
     safety: Table
     search: SearchOptions
     system: SystemTable
@@ -97,13 +99,17 @@ def read_config(folder: Path) -> Config:
         GroundedError: naming the key, what was found and what was expected.
     """
     table = read_toml(folder / FILE)
-    table.expect(*(field.name for field in fields(Config) if field.name != "file"))
+    table.expect(one.name for one in fields(Config) if one.name not in ("file", "seen_in"))
+    limits = table.sub("limits")
+    seen_in = limits.take("seen_in", str, "")
+    limits.values.pop("seen_in", None)
     return Config(
         file=folder / FILE,
         model=_model(table.sub("model")),
         task=_task(table.sub("task")),
         reward=table.sub("reward"),
-        limits=table.sub("limits"),
+        limits=limits,
+        seen_in=seen_in,
         safety=table.sub("safety"),
         search=_search(table.sub("search")),
         system=_system(table.sub("system")),
@@ -112,32 +118,12 @@ def read_config(folder: Path) -> Config:
     )
 
 
-def _values(table: Table, kind: type, *others: str) -> dict[str, Any]:
-    """Read the keys that a table has, checked against the types of a dataclass.
-
-    Args:
-        table: what the user wrote; unknown keys are errors.
-        kind: a dataclass whose fields are numbers, texts, choices, or tables of numbers.
-        others: fields that are read elsewhere.
-    """
-    table.expect(*(one.name for one in fields(kind)))
-    found: dict[str, Any] = {}
-    types = get_type_hints(kind)
-    for one in fields(kind):
-        name, of = one.name, types[one.name]
-        if name in others:
-            continue
-        if get_origin(of) is Mapping:
-            found[name] = table.sub(name).all_numbers()
-        elif get_origin(of) is Literal and table.has(name):
-            found[name] = table.choice(name, get_args(of))
-        elif one.default is MISSING or table.has(name):
-            found[name] = table.take(name, of)
-    return found
-
-
 def _model(table: Table) -> ModelTable:
-    found = ModelTable(**_values(table, ModelTable, "effects"), effects=_effects(table))
+    effects = table.take("effects", list, [])
+    for effect in effects:
+        if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
+            raise table.error("effects", "effects", effect)
+    found = table.into(ModelTable, effects=tuple(effects))
     if bool(found.file) == bool(found.module):
         raise table.error("file", "one", found.file or found.module)
     if found.smoothing < 0:
@@ -145,42 +131,30 @@ def _model(table: Table) -> ModelTable:
     return found
 
 
-def _effects(table: Table) -> tuple[Mapping[str, Any], ...]:
-    effects = table.take("effects", list, [])
-    for effect in effects:
-        if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
-            raise table.error("effects", "effects", effect)
-    return tuple(effects)
-
-
 def _task(table: Table) -> TaskTable:
-    found = TaskTable(**_values(table, TaskTable))
-    if found.dt <= 0:
-        raise table.error("dt", "positive", found.dt)
-    if found.horizon < 1:
-        raise table.error("horizon", "positive", found.horizon)
+    found = table.into(TaskTable)
+    for key in ("dt", "horizon"):
+        if getattr(found, key) <= 0:
+            raise table.error(key, "positive", getattr(found, key))
     return found
 
 
 def _search(table: Table) -> SearchOptions:
-    values = _values(table, SearchOptions)
     try:
-        return SearchOptions(**values)
+        return table.into(SearchOptions)
     except GroundedError as error:
         raise error.at(table.file.name) from None
 
 
 def _system(table: Table) -> SystemTable:
     noise = table.sub("noise")
-    kinds = {}
-    for kind in ("start", "process", "measurement"):
-        inner = noise.sub(kind)
-        kinds[kind] = inner.all_numbers()
-        for name, std in kinds[kind].items():
+    noise.expect(NOISES)
+    kinds = {kind: noise.sub(kind).numbers() for kind in NOISES}
+    for kind, values in kinds.items():
+        for name, std in values.items():
             if std < 0:
-                raise inner.error(name, "natural", std)
-    noise.finish()
-    found = SystemTable(**_values(table, SystemTable, "noise"), noise=kinds)
+                raise noise.sub(kind).error(name, "natural", std)
+    found = table.into(SystemTable, noise=kinds)
     if found.command and found.model:
         raise table.error("command", "alone", found.command)
     if found.seed < 0:
@@ -190,10 +164,9 @@ def _system(table: Table) -> SystemTable:
 
 def _log(table: Table) -> Table:
     """Check that each entry of [log] has a path; its other keys would have no effect without."""
-    for kind in ("state", "input"):
-        group = table.sub(kind)
-        for name in group.names():
-            if not (one := group.sub(name)).has("path"):
+    for group in map(table.sub, ("state", "input")):
+        for name in group.values:
+            if "path" not in (one := group.sub(name)):
                 raise one.error("path", "path")
     return table
 

@@ -100,26 +100,19 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
 
 
 def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
-    seen_in(config)
     pairs = config.limits.pairs(inputs)
     both = np.array([pairs.get(name, (-np.inf, np.inf)) for name in inputs])
     return both[:, 0], both[:, 1]
 
 
-def seen_in(config: Config) -> str:
-    """Return the file name of the log that [limits] were taken from; "" if the user set them."""
-    log: str = config.limits.take("seen_in", str, "")
-    return log
-
-
 def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
     table = config.reward
     kinds = {"state": states, "terminal": states, "input": inputs, "input_change": inputs}
+    table.expect(kinds)
     weights = {}
     for kind, names in kinds.items():
-        given = table.numbers(kind, names)
+        given = table.sub(kind).numbers(names)
         weights[kind] = np.array([given.get(name, 0.0) for name in names])
-    table.finish()
     reward = Reward(**weights)
     if not config.task.target:  # nothing to follow: weights on errors have no meaning
         none = np.zeros(len(states))

@@ -63,17 +63,16 @@ def read_estimate(table: Table, model: Model) -> EstimateTable:
     Raises:
         GroundedError: for an unknown state, or a standard deviation that is not positive.
     """
-    measured = table.numbers("measured", model.state_names)
-    process = table.numbers("process", model.state_names)
-    table.finish()
+    table.expect(("measured", "process"))
+    measured = table.sub("measured").numbers(model.state_names)
+    process = table.sub("process").numbers(model.state_names)
     for kind, values in (("measured", measured), ("process", process)):
         for name, std in values.items():
             if std <= 0:
                 raise table.error(f"{kind}.{name}", "positive", std)
     if not measured:
         raise table.error("measured", "deviations")
-    ordered = {name: measured[name] for name in model.state_names if name in measured}
-    return EstimateTable(ordered, process)
+    return EstimateTable(measured, process)
 
 
 def with_estimates(

@@ -236,7 +236,7 @@ class ForeignLog:
     @property
     def spanned(self) -> bool:
         """Whether [log.span] sets where its run begins."""
-        return bool(self.workspace.config.log.sub("span").names())
+        return bool(self.workspace.config.log.sub("span").values)
 
 
 def mapping_of(workspace: Folder, path: Path) -> LogMapping:
@@ -272,7 +272,7 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
         GroundedError: if a state or an input is not mapped, or the log can't be read.
     """
     model, config, files = workspace.base_model, workspace.config, log_files(path)
-    estimate = read_estimate(config.estimate, model) if config.estimate.names() else None
+    estimate = read_estimate(config.estimate, model) if config.estimate.values else None
     states = tuple(estimate.measured) if estimate else model.state_names
     missing = [s for s in states if s not in mapping.states]
     missing += [i for i in model.input_names if i not in mapping.inputs]

@@ -158,7 +158,7 @@ def _clocks_apart(workspace: Folder, trial: Trial) -> list[Finding]:
     """Return a fault if measured states respond to commands before they are sent."""
     model, estimates = workspace.base_model, workspace.config.estimate
     measured: Collection[str] = model.state_names
-    if estimates.names():
+    if estimates.values:
         from grounded_trials.workspace.intake.opening.estimating import read_estimate
 
         measured = read_estimate(estimates, model).measured
