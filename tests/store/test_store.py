@@ -21,18 +21,8 @@ def test_the_same_content_is_kept_once(tmp_path: Path) -> None:
     assert again.path == first.path and (first.id, second.id) == ("t0001", "t0002")
     assert [s.id for s in store.list()] == ["t0001", "t0002"]
     assert store.read("t0002") == store.read(second.path.name) == b"two"
-    assert store.verify() == ()
+    assert store.verify() == () and first.path.stat().st_mode & 0o222 == 0
     assert not [p for p in store.folder.iterdir() if p.suffix == ".tmp"]
-
-
-def test_a_file_is_taken_from_its_path(tmp_path: Path) -> None:
-    log = tmp_path / "log.mcap"
-    log.write_bytes(bytes(3_000_000))
-    added = Store(tmp_path / "s").add(log)
-    assert added.path.read_bytes() == log.read_bytes()
-    assert added.path.stat().st_mode & 0o222 == 0
-    with pytest.raises(GroundedError, match="nowhere"):
-        Store(tmp_path / "s").add(tmp_path / "nowhere")
 
 
 def test_a_folder_that_cannot_be_made_is_an_error_that_names_it(tmp_path: Path) -> None:

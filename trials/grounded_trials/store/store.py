@@ -32,7 +32,6 @@ from grounded_trials.plain_file import BINARY, open_file, unreadable, unwritable
 
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
-_BLOCK = 2**20
 _TEMPORARY = re.compile(r"-([0-9a-f]{16}|\d+)\.tmp$")  # process ids: of 0.2
 MENDS = {errno.ENOSPC: "space", errno.EDQUOT: "space"}
 MENDS |= dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "permission")
@@ -41,8 +40,12 @@ OLD_S = 3600.0  # [s] age at which a temporary file counts as abandoned
 
 
 @dataclass(frozen=True)
-class _Named:
+class Stored:
+    """A file of the store."""
+
     path: Path
+    number: int
+    digest: str  # the first 16 hex digits of its SHA-256, from its name
 
     @property
     def id(self) -> str:
@@ -51,15 +54,7 @@ class _Named:
 
 
 @dataclass(frozen=True)
-class Stored(_Named):
-    """A file of the store."""
-
-    number: int
-    digest: str  # the first 16 hex digits of its SHA-256, from its name
-
-
-@dataclass(frozen=True)
-class Added(_Named):
+class Added(Stored):
     """The result of adding a file to the store."""
 
     sha256: str
@@ -79,7 +74,6 @@ class Store:
 
     def __init__(self, folder: str | Path, prefix: str = "t") -> None:
         self.folder, self.prefix = Path(folder), prefix
-        self._seen: dict[str, Stored | None] = {}  # parsed file names
         self._listed: tuple[list[str], tuple[Stored, ...]] = ([], ())  # the last listing
 
     def list(self) -> tuple[Stored, ...]:
@@ -94,15 +88,13 @@ class Store:
             return ()
         except OSError as error:
             raise unreadable(self.folder, error) from None
-        if names == self._listed[0]:
-            return self._listed[1]
-        for name in names:
-            if name not in self._seen:
-                match, self._seen[name] = _NAME.match(name), None
-                if match and match[1] == self.prefix:
-                    self._seen[name] = Stored(self.folder / name, int(match[2]), match[3])
-        found = (entry for name in names if (entry := self._seen[name]) is not None)
-        self._listed = names, tuple(sorted(found, key=attrgetter("number", "digest")))
+        if names != self._listed[0]:
+            found = [
+                Stored(self.folder / name, int(match[2]), match[3])
+                for name in names
+                if (match := _NAME.match(name)) and match[1] == self.prefix
+            ]
+            self._listed = names, tuple(sorted(found, key=attrgetter("number", "digest")))
         return self._listed[1]
 
     def digests(self) -> set[str]:
@@ -143,48 +135,47 @@ class Store:
             raise refused("file.changed", entry.path, what="hash")
         return data
 
-    def add(
-        self, source: str | Path | bytes, suffix: str = ".mcap", *, again: bool = False
-    ) -> Added:
-        """Add a copy of a file, or bytes; equal contents are stored once, unless `again`.
+    def add(self, data: bytes, suffix: str = ".mcap", *, again: bool = False) -> Added:
+        """Add a file; equal contents are stored once, unless `again`.
 
         On return, the contents are synced to disk. If the stored file with this hash is damaged, it
-        is replaced by the copy; the damaged file is kept as `NAME.damaged`.
+        is replaced; the damaged file is kept as `NAME.damaged`.
 
         Args:
-            source: the file, or its bytes.
+            data: its contents.
             suffix: suffix of its name in the store.
             again: store equal contents as a new file, for a run that repeats another bit by bit.
 
         Raises:
-            GroundedError: if the source can't be read or the folder can't be written.
+            GroundedError: if the folder can't be written.
         """
+        digest = hashlib.sha256(data).hexdigest()
         with self.locked():
             try:
                 sweep(self.folder, age_s=0.0)  # the lock excludes running processes
-                with _temporary(self.folder / self.prefix) as temporary:
-                    digest = _copy(source, temporary)
-                    return self._place(temporary, digest, suffix, again)
+                entries = self.list()
+                same = next((e for e in entries if e.digest == digest[:DIGITS]), None)
+                whole = same is not None and hash_file(same.path) == digest
+                if same is None or (again and whole):
+                    number = entries[-1].number + 1 if entries else 1
+                    name = f"{self.prefix}{number:04d}-{digest[:DIGITS]}{suffix}"
+                    same = Stored(self.folder / name, number, digest[:DIGITS])
+                elif whole:
+                    return Added(**vars(same), sha256=digest, known=True)
+                else:
+                    same.path.replace(same.path.with_name(same.path.name + ".damaged"))
+                _place(data, same.path, mode=0o444)
             except OSError as error:
                 raise self._unwritable(error) from None
+        return Added(**vars(same), sha256=digest, known=False)
 
     @contextmanager
-    def adding(
-        self, source: str | Path | bytes, suffix: str = ".mcap", *, again: bool = False
-    ) -> Iterator[Added]:
+    def adding(self, data: bytes, suffix: str = ".mcap", *, again: bool = False) -> Iterator[Added]:
         """Add a file as `add` does, and remove it again if the `with` body raises.
 
         It is not removed if another file was added after it, so that numbers have no gaps.
-
-        Args:
-            source: see `add`.
-            suffix: see `add`.
-            again: see `add`.
-
-        Raises:
-            GroundedError: see `add`.
         """
-        added = self.add(source, suffix, again=again)
+        added = self.add(data, suffix, again=again)
         try:
             yield added
         except BaseException:
@@ -207,20 +198,6 @@ class Store:
             except GroundedError as error:
                 damaged.append(Lost(str(entry.path), str(error)))
         return tuple(damaged)
-
-    def _place(self, temporary: Path, digest: str, suffix: str, again: bool) -> Added:
-        entries = self.list()
-        path = next((e.path for e in entries if e.digest == digest[:DIGITS]), None)
-        if path is None or (again and hash_file(path) == digest):
-            number = entries[-1].number + 1 if entries else 1
-            path = self.folder / f"{self.prefix}{number:04d}-{digest[:DIGITS]}{suffix}"
-        elif hash_file(path) == digest:
-            return Added(path, digest, known=True)
-        else:
-            path.replace(path.with_name(path.name + ".damaged"))
-        temporary.rename(path)
-        sync_folder(self.folder)
-        return Added(path, digest, known=False)
 
     @contextmanager
     def locked(self) -> Iterator[None]:
@@ -276,10 +253,7 @@ def write_atomically(path: Path, data: bytes) -> None:
         raise unwritable(path, "folder")
     try:
         sweep(path.parent)
-        with _temporary(path) as temporary:
-            _copy(data, temporary, mode=0o644)
-            temporary.replace(path)
-        sync_folder(path.parent)
+        _place(data, path, mode=0o644)
     except FileNotFoundError:
         raise refused("file.unwritable", path, folder=str(path.parent)) from None
     except OSError as error:
@@ -296,18 +270,24 @@ def sweep(folder: Path, age_s: float = OLD_S) -> None:
                 path.unlink()
 
 
-@contextmanager
-def _temporary(path: Path) -> Iterator[Path]:
-    """Give a hidden name beside a file; what is left there is removed, now or by a later process.
+def _place(data: bytes, path: Path, mode: int) -> None:
+    """Write a file under a hidden name beside it, sync and rename it, and sync the folder.
 
-    It is not named by process id: processes in two containers may have the same id.
+    The name is not that of the process: processes in two containers may have the same id.
     """
     temporary = path.with_name(f".{path.name}-{os.urandom(8).hex()}.tmp")
     try:
-        yield temporary
+        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | BINARY, 0o644)
+        with os.fdopen(descriptor, "wb") as out:
+            out.write(data)
+            out.flush()
+            os.fsync(out.fileno())
+        temporary.chmod(mode)
+        temporary.replace(path)
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
+    sync_folder(path.parent)
 
 
 def sync_folder(folder: Path) -> None:
@@ -321,39 +301,14 @@ def sync_folder(folder: Path) -> None:
         os.close(descriptor)
 
 
-def _copy(source: str | Path | bytes, target: Path, mode: int = 0o444) -> str:
-    """Copy to a new file and sync it; return the SHA-256 of the contents."""
-    hasher = hashlib.sha256()
-    descriptor = os.open(target, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | BINARY, 0o644)
-    with os.fdopen(descriptor, "wb") as out:
-        for block in _blocks(source):
-            hasher.update(block)
-            out.write(block)
-        out.flush()
-        os.fsync(out.fileno())
-    target.chmod(mode)
-    return hasher.hexdigest()
-
-
-def _blocks(source: str | Path | bytes) -> Iterator[bytes]:
-    if isinstance(source, bytes):
-        yield source
-        return
-    try:
-        with open_file(Path(source)) as stream:
-            while block := stream.read(_BLOCK):
-                yield block
-    except OSError as error:
-        raise unreadable(source, error) from None
-
-
 def hash_file(path: Path) -> str:
     """Return the SHA-256 of a file, read in blocks.
 
     Raises:
         GroundedError: if it can't be read.
     """
-    hasher = hashlib.sha256()
-    for block in _blocks(path):
-        hasher.update(block)
-    return hasher.hexdigest()
+    try:
+        with open_file(path) as stream:
+            return hashlib.file_digest(stream, "sha256").hexdigest()
+    except OSError as error:
+        raise unreadable(path, error) from None
