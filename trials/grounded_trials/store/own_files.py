@@ -21,7 +21,7 @@ import numpy as np
 from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded_trials.formats.bad import BadMessage, BadSchema
+from grounded_trials.formats.bad import BadSchema
 from grounded_trials.formats.mcap_records import (
     Attachment,
     Channel,
@@ -31,10 +31,8 @@ from grounded_trials.formats.mcap_records import (
     Schema,
 )
 from grounded_trials.formats.mcap_walk import DamagedFile, read_records
-from grounded_trials.formats.messages import decoder_of, fields_of
 from grounded_trials.formats.protobuf import double_tag, doubles_tag, numbers_in, uniform_doubles
 from grounded_trials.plain_file import read_file, unreadable
-from grounded_trials.within import within
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 STEP_LIMIT = 2_000_000  # messages per channel
@@ -56,7 +54,7 @@ class OwnFile:
     data: bytes
     meta: dict[str, str]
     attachments: dict[str, bytes]
-    types: dict[str, tuple[Channel, Schema]]
+    types: dict[str, Schema]
     messages: dict[str, list[Messages]]
 
     @property
@@ -130,20 +128,19 @@ class OwnFile:
         """Return the numbers of some fields of a topic's messages, (N, size) each."""
         if topic not in self.types:
             raise unknown("channel", topic, self.types, self.name)
-        batches = self.messages.get(topic, [])
+        where, batches = f"{self.name}: {topic}", self.messages.get(topic, [])
         try:
-            doubles = numbers_in(self.types[topic][1])
+            doubles = numbers_in(self.types[topic])
         except BadSchema as error:
-            raise unreadable(f"{self.name}: {topic}", error) from None
+            raise unreadable(where, error) from None
         there = {name: number for name, (number, many) in doubles.items() if many is listed}
         for name in sizes:
             if name not in there:
-                what, where = "list" if listed else "number", f"{self.name}: {topic}"
-                raise unknown(what, name, there, where)
-        numbers = [(there[name], size) for name, size in sizes.items()]
-        tags = [(doubles_tag(n, size) if listed else double_tag(n), size) for n, size in numbers]
+                raise unknown("list" if listed else "number", name, there, where)
         if not batches:
             return [np.zeros((0, size)) for size in sizes.values()]
+        tag = doubles_tag if listed else lambda number, size: double_tag(number)
+        tags = [(tag(there[name], size), size) for name, size in sizes.items()]
         # of an open-loop policy only the first list is there
         for some in (tags, tags[:1]) if listed else (tags,):
             read = [uniform_doubles(b.buffer, b.starts, b.ends, some) for b in batches]
@@ -151,28 +148,7 @@ class OwnFile:
             if len(uniform) == len(batches):
                 found = [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
                 return found + [np.zeros((0, size)) for _, size in tags[len(some) :]]
-        # laid out otherwise: it may take long
-        return within(self.name, len(self.data), self._fields, topic, batches, sizes, listed)
-
-    def _fields(
-        self, topic: str, batches: list[Messages], sizes: Mapping[str, int], listed: bool
-    ) -> list[Array]:
-        try:
-            decoder = decoder_of(*self.types[topic])
-            objects = [o for b in batches for part in decoder.parts(b) for o in part.objects]
-        except BadSchema as error:
-            raise unreadable(f"{self.name}: {topic}", error) from None
-        except BadMessage as error:
-            raise DamagedFile(self.name, 0, "record", f"{topic}", str(error)) from None
-        found = []
-        for name, size in sizes.items():
-            values = fields_of(objects, name)
-            counts = [len(one) if listed else 1 for one in values]
-            if any(counts) and counts != [size] * len(counts):
-                k = next(k for k, count in enumerate(counts) if count != size)
-                raise wrong(f"{self.name}: {topic}[{k}].{name}", (counts[k],), shape=f"({size},)")
-            found.append(np.array(values if any(counts) else [], np.float64).reshape(-1, size))
-        return found
+        raise unreadable(where, "messages that grounded did not write")
 
     def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
         """Raise an error if a topic's sample k is over half a step away from start_ns + k dt."""
@@ -245,11 +221,11 @@ def _sorted(
         yield channels[identity].topic, batch.of(identity)
 
 
-def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> tuple[Channel, Schema]:
+def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Schema:
     schema = schemas.get(channel.schema_id)
     if channel.encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
         raise unreadable(f"{name}: {channel.topic}", channel.encoding)
-    return channel, schema
+    return schema
 
 
 def stated(
