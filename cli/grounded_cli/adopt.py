@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 
 from grounded_cli.console.options import misuse
 from grounded_cli.console.terminal import field, sentence, show, tell
 from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import ALONE, moved
-from grounded_trials.workspace.adoption import Adopted, Undone, numbers_in
+from grounded_trials.workspace.adoption import Adopted, numbers_in
 
 DIGITS = 4  # of a parameter, at least
 
 
-def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[Adopted | Undone]:
+def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[Adopted]:
     """Adopt effects, or undo the last adoption; print what changed."""
     if undo == bool(effects) or (undo and effect_only):
         raise misuse("EFFECT...", "--undo")
     workspace = open_workspace()
     before, file = workspace.base_model.params, workspace.config.file
     were = numbers_in(workspace)
-    if undo:
-        done: Adopted | Undone = workspace.undo_adoption()
-    else:
-        done = workspace.adopt(*effects, parameters=not effect_only)
+    adopted = partial(workspace.adopt, *effects, parameters=not effect_only)
+    done = workspace.undo_adoption() if undo else adopted()
     yield done
-    if isinstance(done, Undone):
+    if undo:
         sentence(f"undone: {', '.join(done.undone)} ({file})")
         now = workspace.base_model.params
         values = {k: now[k].value for k, was in before.items() if was.value != now[k].value}
@@ -45,6 +44,6 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
         show("[model] effects:")
     for name, (value, unit) in changed.items():
         show(field(name, moved(were[name][0], value, unit, DIGITS), "  "))
-    if isinstance(done, Undone):
+    if undo:
         show(field("adopted", ", ".join(str(one["name"]) for one in done.effects) or "none"))
     show(f"\n{next_line(done.then)}")

@@ -80,7 +80,7 @@ def gather(workspace: Folder) -> Findings:
         then=asked,
         better=better,
         since=since,
-        adopted=adopted_rows(workspace, diagnosis),
+        adopted=adopted_rows(workspace),
         estimated=_estimated(task, contents, {t.id for t in fitting}),
         folder=workspace.address,
     )

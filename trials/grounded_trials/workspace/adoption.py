@@ -51,35 +51,21 @@ Effects = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Adopted(Document):
-    """The model's effects and parameters after an adoption."""
+    """The model's effects and parameters after an adoption, or after one was undone."""
 
     effects: tuple[Mapping[str, Any], ...]  # all adopted effects
-    params: Mapping[str, float]  # model parameters written with the new effects
-    claimed: bool  # whether the diagnosis claims the new effects; else one was adopted alone
+    params: Mapping[str, float]  # model parameters written with the new effects; undone: all
+    claimed: bool = False  # whether the diagnosis claims the new effects
     jointly: tuple[str, ...] = ()  # parameters and effects determined only with the others
     along: tuple[str, ...] = ()  # late and filtering sensors that were adopted without being named
     left: Mapping[str, float] = field(default_factory=dict)  # fitted values that were not adopted
+    undone: tuple[str, ...] = ()  # the effects of the adoption that was undone
     findings: tuple[Finding, ...] = ()  # what an adoption leaves to be done or known
     then: NextCommand = field(metadata=UNSAID, default=PROPOSE)
 
     def summary(self) -> str:
         """Return the effects that the model has now."""
         return ", ".join(_names(self.effects))
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Undone(Document):
-    """The model's effects and parameters after an adoption was undone."""
-
-    undone: tuple[str, ...]  # the effects of the adoption that was undone
-    effects: tuple[Mapping[str, Any], ...]  # all adopted effects
-    params: Mapping[str, float]  # [model] params
-    findings: tuple[Finding, ...] = ()
-    then: NextCommand = field(metadata=UNSAID, default=PROPOSE)
-
-    def summary(self) -> str:
-        """Return the effects that were removed from the model."""
-        return ", ".join(self.undone)
 
 
 def _names(effects: Effects) -> list[str]:
@@ -94,20 +80,6 @@ def _numbers(effects: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, str, s
 
 
 # what a diagnosis offers
-
-
-def left_behind(diagnosis: Diagnosis) -> dict[str, Estimate]:
-    """Return the parameters, also of adopted effects, that changed in the fit but are not adopted.
-
-    The prediction errors of the diagnosis include their changes.
-    """
-    nominal, kept = made_from(diagnosis).nominal, diagnosis.adoptable
-    return {
-        name: e
-        for name, e in diagnosis.parameters.items()
-        if name not in kept and (old := nominal.get(name)) is not None
-        if abs(e.value - old) > NO_CHANGE * max(abs(old), e.std)
-    }
 
 
 def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
@@ -249,7 +221,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     # The model with them.
     whole_fit = parameters and bool(physics) and claimed
     calibrated = diagnosis.adoptable if whole_fit else {}
-    model, before = workspace.config.model, made_from(diagnosis).effects
+    model, known = workspace.config.model, made_from(diagnosis)
     nominal = _nominal(workspace, diagnosis)
     own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
     params = dict(model.params) | own
@@ -260,13 +232,28 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     set_in_model(workspace.config.file, params if own else None, adopted or None)
     after = {"effects": adopted or _written(model)["effects"], "params": params}
     step = Step(tuple(names), _written(model), after)
-    std = _told_std(diagnosis, names, calibrated)
-    keep(workspace, _with_std(std, own, adopted), adoptions=(*earlier, step))
+    now = own | {name: value for _, _, name, value in _numbers(adopted)}
+    std = {name: e.std for name, e in calibrated.items()}
+    for row in (row for row in diagnosis.ranking if row.effect in names):
+        family, _, target = row.effect.partition(":")
+        for q, e in row.params.items():
+            std[target if family == "parameter" else param_name(row.effect, q)] = e.std
+    sure = {n: (now[n], s) for n, s in std.items() if n in now and math.isfinite(s)}
+    keep(workspace, sure, adoptions=(*earlier, step))
 
-    # What differs from the fit in which the values were found.
-    left = left_behind(diagnosis) if whole_fit else {}
-    left = {name: one for name, one in left.items() if name not in own}
-    done = Adopted(
+    # What changed in the fit, so that its prediction errors include it, but is not adopted.
+    left = {
+        name: e
+        for name, e in (diagnosis.parameters if whole_fit else {}).items()
+        if name not in {*calibrated, *own} and (old := known.nominal.get(name)) is not None
+        if abs(e.value - old) > NO_CHANGE * max(abs(old), e.std)
+    }
+    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(known.effects.values())}
+    told = [*_readings(workspace.base_model, [e for e in adopted if e["name"] in asked])]
+    for name, e in left.items():
+        was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
+        told.append(found("model.not_told", called.get(name, name), kept=was, value=value))
+    return Adopted(
         effects=tuple(adopted),
         params=own,
         claimed=claimed,
@@ -276,15 +263,9 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         ),
         along=tuple(name for name in names if name not in asked),
         left={name: one.value for name, one in left.items()},
+        findings=settle(told),
         then=to_plan(workspace),
     )
-    named = [effect for effect in adopted if effect["name"] in asked]
-    told = [*_readings(workspace.base_model, named)]
-    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(before.values())}
-    for name, e in left.items():
-        was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
-        told.append(found("model.not_told", called.get(name, name), kept=was, value=value))
-    return replace(done, findings=settle(told))
 
 
 def _with_curves(diagnosis: Diagnosis, names: list[str]) -> list[str]:
@@ -352,7 +333,7 @@ def _readings(model: Model, effects: Effects) -> Iterator[Finding]:
             yield found("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
 
 
-def undo_adoption(workspace: Folder) -> Undone:
+def undo_adoption(workspace: Folder) -> Adopted:
     """Undo the last `adopt`: restore the effects and params of grounded.toml.
 
     Raises:
@@ -370,12 +351,8 @@ def undo_adoption(workspace: Folder) -> Undone:
         raise refused("model.edited", file, adopted=last.names, had=had)
     set_in_model(file, params=params, effects=effects)
     keep(workspace, adoptions=known.adoptions[:-1], undone=(*known.undone, *last.names))
-    return Undone(
-        undone=last.names,
-        effects=tuple(effects),
-        params=params,
-        then=to_plan(workspace),
-    )
+    then = to_plan(workspace)
+    return Adopted(effects=tuple(effects), params=params, undone=last.names, then=then)
 
 
 def _written(model: ModelTable) -> dict[str, Any]:
@@ -441,26 +418,6 @@ def diagnosed_again(workspace: Folder) -> None:
         keep(workspace, undone=())
 
 
-def _told_std(
-    diagnosis: Diagnosis, names: Sequence[str], calibrated: Mapping[str, Estimate]
-) -> dict[str, float]:
-    """Return the standard deviations of the values that are adopted, by parameter name."""
-    std = {name: e.std for name, e in calibrated.items()}
-    for row in (row for row in diagnosis.ranking if row.effect in names):
-        family, _, target = row.effect.partition(":")
-        for q, e in row.params.items():
-            std[target if family == "parameter" else param_name(row.effect, q)] = e.std
-    return std
-
-
-def _with_std(
-    std: Mapping[str, float], own: Mapping[str, float], effects: Effects
-) -> dict[str, tuple[float, float]]:
-    """Return values that are written to [model] with their standard deviations, where known."""
-    now = {**own, **{name: value for _, _, name, value in _numbers(effects)}}
-    return {name: (now[name], s) for name, s in std.items() if name in now and math.isfinite(s)}
-
-
 # the model as it is now
 
 
@@ -484,29 +441,21 @@ def numbers_in(workspace: Folder) -> dict[str, tuple[float, str]]:
     return {f"{q} of {e}": (v, units_of(workspace, e).get(q, "")) for e, q, _, v in numbers}
 
 
-def known_values(workspace: Folder, diagnosis: Diagnosis | None = None) -> dict[str, Estimate]:
+def known_values(workspace: Folder) -> dict[str, Estimate]:
     """Return the values of parameters and adopted effects, by parameter name, with their +-.
 
-    The +- is that of the diagnosis, or of the adoption or fit that wrote this value; else NaN.
+    The +- is that of the adoption or the fit that wrote this value, else NaN.
     """
-    own = dict(diagnosis.parameters) if diagnosis else {}
-    for row in diagnosis.ranking if diagnosis else ():
-        own |= {param_name(row.effect, q): e for q, e in row.params.items()}
-    fitted = {name: (e.value, e.std) for name, e in own.items()}
-    sources = (fitted, _readable(workspace).values)
+    kept = _readable(workspace).values
     now = {name: (one.value, one.unit) for name, one in workspace.base_model.params.items()}
     for effect, q, name, value in _numbers(workspace.config.model.effects):
         now[name] = float(value), units_of(workspace, effect)[q]
     found_values = dict[str, Estimate]()
     for name, (value, unit) in now.items():
-        pairs = (source[name] for source in sources if len(source.get(name, ())) == 2)
-        same = (std for at, std in pairs if _same(at, value))
-        found_values[name] = Estimate(value, next(same, math.nan), unit=unit)
+        at, std = kept[name] if len(kept.get(name, ())) == 2 else (math.nan, math.nan)
+        same = math.isclose(at, value, rel_tol=WRITTEN, abs_tol=1e-12)
+        found_values[name] = Estimate(value, std if same else math.nan, unit=unit)
     return found_values
-
-
-def _same(one: float, other: float) -> bool:
-    return math.isclose(one, other, rel_tol=WRITTEN, abs_tol=1e-12)
 
 
 @dataclass(frozen=True, eq=False)
@@ -537,13 +486,13 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     return Better(workspace.planner, "with adopted effects") if table.effects else None
 
 
-def adopted_rows(workspace: Folder, diagnosis: Diagnosis | None) -> tuple[tuple[str, str], ...]:
+def adopted_rows(workspace: Folder) -> tuple[tuple[str, str], ...]:
     """Return name and values of each adopted effect, then of each changed parameter.
 
     That is how a workspace's model differs from model.py.
     """
     table, found = workspace.config.model, list[tuple[str, str]]()
-    known = known_values(workspace, diagnosis) if table.effects or table.params else {}
+    known = known_values(workspace) if table.effects or table.params else {}
     for effect in table.effects:
         name = str(effect["name"])
         numbers = ((q, param_name(name, q)) for q in effect if q != "name")

@@ -325,7 +325,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         off_target_of(workspace.task, best.trials if best else ()),
         last,
         here.since if last else None,
-        _adopted(workspace, last),
+        _adopted(workspace),
         much_noise(best.noise_cost, best.utility) if best else None,
     )
 
@@ -336,13 +336,13 @@ def _lacks(workspace: Folder, diagnosis: Diagnosis) -> Finding | None:
     return not_adopted(workspace, diagnosis)
 
 
-def _adopted(workspace: Folder, last: Diagnosis | None) -> tuple[tuple[str, str], ...]:
+def _adopted(workspace: Folder) -> tuple[tuple[str, str], ...]:
     """Return what was adopted, without slow imports if nothing was."""
     if not (workspace.config.model.effects or workspace.config.model.params):
         return ()
     from grounded_trials.workspace.adoption import adopted_rows
 
-    return adopted_rows(workspace, last)
+    return adopted_rows(workspace)
 
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:
