@@ -59,13 +59,9 @@ class Contents:
     trials: tuple[StoredTrial, ...]  # in order of arrival
     candidates: tuple[Candidate, ...]  # those of the search for this task, in order of proposal
     lost: tuple[Lost, ...]
+    errors: tuple[GroundedError, ...]  # about damaged files, also where another copy was read
     # of the search, without some trials
     standings: dict[frozenset[str], Standing] = field(init=False, default_factory=dict)
-
-
-def _named(one: Lost) -> Lost:
-    """Return a lost file by its name."""
-    return replace(one, file=Path(one.file).name)
 
 
 class Folder:
@@ -108,7 +104,7 @@ class Folder:
         known("parameter", params, model.params, "the model", "grounded.toml: [model] params")
         return model.with_values(params)
 
-    @property
+    @cached_property
     def log_mapping(self) -> LogMapping | None:
         """Where [log] finds the signals of the model; None without that table."""
         if not self.config.log.values:
@@ -152,8 +148,22 @@ class Folder:
         return planner.with_model(replace(model, params={**model.params, **own}))
 
     @cached_property
-    def _trials(self) -> tuple[StoredTrial, ...]:
-        return self._read_trials(None)
+    def _trials(self) -> tuple[tuple[StoredTrial, ...], tuple[Lost, ...], list[GroundedError]]:
+        """The stored trials, the damaged and missing files, and the errors about damaged ones."""
+        broken, found, errors = list[Lost](), list[StoredTrial](), list[GroundedError]()
+        known = noted(self.notes.read(broken))
+        for stored in self.store.list():
+            try:
+                if known.why_aside(stored) is None:
+                    found.append(self._whole(stored))
+            except GroundedError as error:
+                errors.append(error)
+                broken.append(Lost(str(stored.path), str(error)))
+        lost = (
+            replace(one, file=Path(one.file).name) for one in (*broken, *known.gone(self.store))
+        )
+        trials = named_apart([*grouped(found, known)], known, self.candidate_path)
+        return trials, tuple(lost), errors
 
     @cached_property
     def _contents(self) -> dict[frozenset[str], Contents]:
@@ -188,31 +198,34 @@ class Folder:
         Raises:
             GroundedError: if the task can't be built; if strict, also for damaged files.
         """
-        lost: list[Lost] | None = None if strict else []
         names = self.names()
-        if strict and names in self._contents:
-            return self._contents[names]
-        trials = self._trials if lost is None else self._read_trials(lost)
-        candidates = tuple(self._read_candidates(trials, lost))
-        found = Contents(trials, candidates, tuple(lost or ()))
+        if names not in self._contents:
+            trials, missing, damaged = self._trials
+            lost, errors = [*missing], [*damaged]
+            candidates = tuple(self._read_candidates(trials, lost, errors))
+            self._contents[names] = Contents(trials, candidates, tuple(lost), tuple(errors))
+        found = self._contents[names]
         if strict:
-            self._contents[names] = found
+            self.trials()
+            for error in found.errors:
+                raise error
         return found
 
     def trials(self) -> tuple[StoredTrial, ...]:
         """Return every stored trial that is not set aside, in order of arrival.
 
         Raises:
-            GroundedError: if one is damaged, naming it.
+            GroundedError: if one, or a note, is damaged, naming it.
         """
-        return self._trials
+        _ = self.noted
+        trials, _, errors = self._trials
+        for error in errors:
+            raise error
+        return trials
 
     def whole_trials(self) -> tuple[StoredTrial, ...]:
         """Return the stored trials that are not damaged."""
-        try:
-            return self._trials
-        except GroundedError:
-            return self._read_trials([])
+        return self._trials[0]
 
     def discarded(self) -> dict[str, str]:
         """Return the trials that are set aside, t0004 -> why."""
@@ -328,58 +341,33 @@ class Folder:
             candidate = replace(candidate, id=self.next_id())
         return saved
 
-    def _read_trials(self, lost: list[Lost] | None) -> tuple[StoredTrial, ...]:
-        """Read the stored trials; add damaged and missing ones to `lost`; raise if it is None."""
-        broken: list[Lost] = []
-        if lost is not None and "_trials" in vars(self):  # they were read, and none is damaged
-            lost += map(_named, self.noted.gone(self.store))
-            return self._trials
-        known, found = self.noted if lost is None else noted(self.notes.read(broken)), []
-        for stored in self.store.list():
-            try:
-                if known.why_aside(stored) is None:
-                    found.append(self._whole(stored))
-            except GroundedError as error:
-                if lost is None:
-                    raise
-                broken.append(Lost(str(stored.path), str(error)))
-        if lost is not None:
-            lost += map(_named, (*broken, *known.gone(self.store)))
-        trials = named_apart([*grouped(found, known)], known, self.candidate_path)
-        if not broken:
-            vars(self)["_trials"] = trials
-        return trials
-
     def _whole(self, stored: Stored) -> StoredTrial:
         trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
         trial = replace(trial, id=stored.id)
         return StoredTrial(stored, interpolate_gaps(trial).trial, meta, trial, policy)
 
     def _read_candidates(
-        self, trials: tuple[StoredTrial, ...], lost: list[Lost] | None
+        self, trials: tuple[StoredTrial, ...], lost: list[Lost], errors: list[GroundedError]
     ) -> Iterator[Candidate]:
-        """Yield the search's candidates; unless strict, a trial's copy replaces a damaged file."""
+        """Yield the search's candidates; a trial's copy replaces a damaged file."""
         ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
-            why = GroundedError("its file is missing and no trial contains it")
+            file = f"candidates/{identity}.mcap"
+            why = unreadable(file, "its file is missing and no trial contains it")
             for read in self._sources(identity, trials):
                 try:
                     found = StoredCandidate.of(read(), identity)
                     trial, known = ran.get(identity, ("", ""))
                     if known and found.sha256 != known:
-                        name = f"candidates/{identity}.mcap"
-                        raise refused("file.changed", name, what="policy", lost=trial)
+                        raise refused("file.changed", file, what="policy", lost=trial)
                 except GroundedError as error:
-                    if lost is None:
-                        raise
-                    why = error
+                    errors.append(why := error)
                     continue
                 if (found.kind, found.task) == ("search", self.task.hash):
                     yield found.candidate
                 break
             else:
-                if lost is None:
-                    raise unreadable(f"candidates/{identity}.mcap", why)
+                errors.append(why)
                 lost.append(Lost(f"{identity}.mcap", str(why)))
 
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:

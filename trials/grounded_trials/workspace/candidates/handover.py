@@ -176,13 +176,7 @@ class Check:
     @cached_property
     def standing(self) -> Standing:
         """The standing of the search."""
-        if self.now is not None:
-            return self.now
-        try:
-            contents = self.workspace.read()
-        except GroundedError:
-            contents = replace(self.workspace.read(strict=False), trials=self.trials)
-        return standing_of(self.workspace, contents)
+        return self.now or standing_of(self.workspace, self.workspace.read(strict=False))
 
     @property
     def same_task(self) -> bool:
