@@ -23,7 +23,7 @@ from grounded_trials.workspace.fitting import apply_fit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import model_print, read_diagnosis
 from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis
-from grounded_trials.workspace.user_files.config import set_in_model
+from grounded_trials.workspace.user_files.config import set_keys
 from recorded import LOGGED, record
 from reported import DIAGNOSIS, cart, copied, diagnosed
 from workspaces import make
@@ -294,7 +294,7 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
 
 
 def test_a_changed_model_that_promises_nothing_is_said_to(w):
-    set_in_model(w.config.file, effects=[{"name": "viscous_friction:v", "k": 1e-9}])
+    set_keys(w.config.file, "model", effects=[{"name": "viscous_friction:v", "k": 1e-9}])
     found = w.propose()
     assert found.candidate is None and "plan.no_better" in {one.code for one in found.findings}
 
@@ -405,9 +405,9 @@ def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(w):
 
 
 def test_an_adoption_under_later_changes_is_not_undone(w):
-    set_in_model(w.config.file, effects=[{"name": "offset:v", "c": 0.5}])
+    set_keys(w.config.file, "model", effects=[{"name": "offset:v", "c": 0.5}])
     w.adopt("viscous_friction:v")
-    set_in_model(w.config.file, params={"mass": 3.25})
+    set_keys(w.config.file, "model", params={"mass": 3.25})
     changed = w.config.file.read_text()
     done = grounded("-C", w.folder, "adopt", "--undo")
     assert done.code == 1 and holds(done.err, "viscous_friction:v", 'name = "offset:v", c = 0.5')
@@ -422,10 +422,10 @@ def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_ex
     w = Workspace(make(tmp_path / "w").folder)
     w.learn(2)
     late, bent = {"name": "delay:force", "d": 0.02}, {"name": "dead_zone:force", "c": 0.01}
-    set_in_model(w.config.file, effects=[late, bent])
+    set_keys(w.config.file, "model", effects=[late, bent])
     assert w.fit().to_json()["not_fitted"] == ["delay:force"]
     assert w.fit(latency=True).to_json()["not_fitted"] == []
-    set_in_model(w.config.file, effects=[late])
+    set_keys(w.config.file, "model", effects=[late])
     fitted = w.fit().to_json()
     found = fitted["params"]["delay_force_d"]
     assert fitted["not_fitted"] == [] and found["low"] < found["high"] and found["unit"] == "s"

@@ -95,11 +95,11 @@ def test_a_copied_workspace_is_the_same_workspace(tmp_path):
 
 
 def test_comments_and_layout_of_grounded_toml_survive_fit_apply(tmp_path):
-    from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
+    from grounded_trials.workspace.user_files.config import set_keys
 
     w = make(tmp_path / "w", config="# mine\n" + CONFIG.replace("dt = 0.05", "dt = 0.05  # 20 Hz"))
-    set_in_model(w.config.file, params={"mass": 2.0})
-    set_numbers(w.config.file, "task", latency={"force": 0.07})
+    set_keys(w.config.file, "model", params={"mass": 2.0})
+    set_keys(w.config.file, "task", latency={"force": 0.07})
     text = w.config.file.read_text()
     assert text.startswith("# mine\n") and "dt = 0.05  # 20 Hz" in text
     assert read_config(w.folder).model.params == {"mass": 2.0}

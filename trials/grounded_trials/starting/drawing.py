@@ -43,7 +43,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unknown_trial
 from grounded_trials.workspace.new_target import replace_target
 from grounded_trials.workspace.off_target import driven
-from grounded_trials.workspace.user_files.config import set_numbers
+from grounded_trials.workspace.user_files.config import set_keys
 from grounded_trials.workspace.user_files.task_file import read_target
 
 
@@ -208,7 +208,7 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     extra = () if rests is None else (rests.weights, [*rests.columns])
     path = replace_target(workspace.config, columns, model, *extra)
     if rest:
-        set_numbers(workspace.config.file, "task", start=rest)
+        set_keys(workspace.config.file, "task", start=rest)
     workspace.forget()
 
     # What is told of it.

@@ -38,7 +38,7 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.readings import changed_since, last_again, taken_out
-from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_in_model
+from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_keys
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 KEPT = "adoptions.json"  # in reports/
@@ -221,7 +221,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     # The model with them.
     whole_fit = parameters and bool(physics) and claimed
     calibrated = diagnosis.adoptable if whole_fit else {}
-    model, known = workspace.config.model, made_from(diagnosis)
+    file, model, known = workspace.config.file, workspace.config.model, made_from(diagnosis)
     nominal = _nominal(workspace, diagnosis)
     own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
     params = dict(model.params) | own
@@ -229,7 +229,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     planner_of(workspace.task, adopted)  # a model that can't be built from these effects
 
     # Write it, how it can be undone, and how sure the values are.
-    set_in_model(workspace.config.file, params if own else None, adopted or None)
+    set_keys(file, "model", params=params if own else None, effects=adopted or None)
     after = {"effects": adopted or _written(model)["effects"], "params": params}
     step = Step(tuple(names), _written(model), after)
     now = own | {name: value for _, _, name, value in _numbers(adopted)}
@@ -346,10 +346,9 @@ def undo_adoption(workspace: Folder) -> Adopted:
     last = known.adoptions[-1]
     params, effects = last.before["params"], last.before["effects"]
     if _written(model) != last.after:
-        was = as_toml(params, effects)
-        had = listed(f"{name} = {value.as_string()}" for name, value in was.items())
+        had = listed(f"{name} = {as_toml(v).as_string()}" for name, v in last.before.items())
         raise refused("model.edited", file, adopted=last.names, had=had)
-    set_in_model(file, params=params, effects=effects)
+    set_keys(file, "model", params=params, effects=effects)
     keep(workspace, adoptions=known.adoptions[:-1], undone=(*known.undone, *last.names))
     then = to_plan(workspace)
     return Adopted(effects=tuple(effects), params=params, undone=last.names, then=then)

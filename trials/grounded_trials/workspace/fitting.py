@@ -28,7 +28,7 @@ from grounded_trials.workspace.last_diagnosis import chosen, ids_of, readable_di
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.readings import one_message
-from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
+from grounded_trials.workspace.user_files.config import set_keys
 from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
@@ -207,10 +207,11 @@ def apply_fit(workspace: Folder, found: Fit) -> None:
     if "latency" in found.params and found.params["latency"].identified:
         delays = zip(base.input_names, found.latency, strict=True)
         late = {name: round(float(d), 6) for name, d in delays}
-        set_numbers(workspace.config.file, "task", latency=late)
+        set_keys(workspace.config.file, "task", latency=late)
         effects = [e for e in effects if not str(e["name"]).startswith("delay:")]
-    set_in_model(
+    set_keys(
         workspace.config.file,
+        "model",
         params=dict(table.params) | own,
         effects=effects if table.effects else None,
     )

@@ -10,7 +10,6 @@ from grounded.model import Model
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening.estimating import EstimateTable, with_estimates
-from grounded_trials.workspace.user_files.config import set_in_model
 from workspaces import CONFIG, make
 
 TABLE = EstimateTable({"x": 0.002}, {})
@@ -103,7 +102,7 @@ def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
         np.savetxt(tmp_path / f"{k}.csv", table, "%.5f", ",", header="t,x,force", comments="")
     first = Workspace(folder).ingest(tmp_path / "0.csv", data=True)
     before = Workspace(folder).trials()[0].measured.states
-    set_in_model(folder / "grounded.toml", effects=[{"name": "coulomb_friction:v", "c": 0.8}])
+    set_keys(folder / "grounded.toml", "model", effects=[{"name": "coulomb_friction:v", "c": 0.8}])
     w = Workspace(folder)
     again = w.ingest(tmp_path / "0.csv", data=True)
     assert again.known and again.trial == first.trial

@@ -43,7 +43,7 @@ from grounded_trials.workspace.adoption import known_values, units_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held
 from grounded_trials.workspace.last_diagnosis import usable_ids
-from grounded_trials.workspace.user_files.config import set_in_model, set_numbers
+from grounded_trials.workspace.user_files.config import set_keys
 
 # what each number of the file is: an effect of the input, its quantity
 KEYS = {
@@ -142,8 +142,7 @@ def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]
             raise unknown("input", names, model.input_names)
         for name in inputs:
             _begin(path, table, name, driven.get(name, ""), effects, priors)
-    set_in_model(workspace.config.file, effects=effects)
-    set_numbers(workspace.config.file, "model", priors=priors)
+    set_keys(workspace.config.file, "model", effects=effects, priors=priors)
     workspace.forget()
     _ = workspace.planner  # raises if the model can't be built from them
     return tuple(effects)

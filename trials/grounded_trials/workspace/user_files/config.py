@@ -171,39 +171,49 @@ def _log(table: Table) -> Table:
     return table
 
 
-def set_in_model(
-    file: Path,
-    params: Mapping[str, float] | None = None,
-    effects: Sequence[Mapping[str, Any]] | None = None,
-) -> None:
-    """Replace [model] params and/or effects; the rest of the file is unchanged.
+def as_toml(value: Any) -> Any:
+    """Return a value for tomlkit: tables inline, several in a list on a line each."""
+    import tomlkit
+
+    if isinstance(value, Mapping):
+        table = tomlkit.inline_table()
+        table.update(dict(value))
+        return table
+    if isinstance(value, list | tuple):
+        array = tomlkit.array()
+        for one in value:
+            array.append(as_toml(one))
+        return array.multiline(len(value) > 1)
+    return value
+
+
+def set_keys(file: Path, table: str, **values: Any) -> None:
+    """Replace keys in a table of grounded.toml; the rest of the file is unchanged.
+
+    Args:
+        file: grounded.toml.
+        table: the name of the table.
+        **values: the new values; None: the old one stays, an empty one is removed.
 
     Raises:
         GroundedError: if the file can't be written.
     """
-    _change(file, "model", as_toml(params, effects))
-
-
-def as_toml(
-    params: Mapping[str, float] | None, effects: Sequence[Mapping[str, Any]] | None
-) -> dict[str, Any]:
-    """Return `params` and `effects` as values of [model] in grounded.toml; None is left out."""
     import tomlkit
 
-    found: dict[str, Any] = {}
-    if params is not None:
-        found["params"] = _inline(params)
-    if effects is not None:
-        array = tomlkit.array()
-        for effect in effects:
-            array.append(_inline(effect))
-        found["effects"] = array.multiline(len(effects) > 1)
-    return found
+    document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
+    _put(document, table, values)
+    write_atomically(file, tomlkit.dumps(document).encode())
 
 
-def set_numbers(file: Path, table: str, **values: Mapping[str, float]) -> None:
-    """Replace numbers by name, such as start, latency or priors, in a table of grounded.toml."""
-    _change(file, table, {key: _inline(numbers) for key, numbers in values.items()})
+def _put(document: Any, where: str, values: Mapping[str, Any]) -> None:
+    import tomlkit
+
+    table: Any = document.setdefault(where, tomlkit.table())
+    for name, value in values.items():
+        if value:
+            table[name] = as_toml(value)
+        elif value is not None:
+            table.pop(name, None)  # an empty value is equivalent to a missing key
 
 
 def set_target(
@@ -235,45 +245,43 @@ def set_target(
     """
     import tomlkit
 
-    old_text = file.read_text(encoding="utf-8-sig")
-    document, made, blank = tomlkit.parse(old_text), made_changes(old_text), dict[str, float]()
-    _put(document, "task", {"target": name, "horizon": steps})
-    reward = document.get("reward", {})
-    own, ends = dict(reward.get("state", {})), dict(reward.get("terminal", {}))
-    given = [{k: w for k, w in usual.items() if k in own or k not in ends}]
-    given.append(dict.fromkeys(given[0], 1.0))
-    alike = [
-        one
-        for one in given
-        if own.keys() == one.keys()
-        and all(abs(own[k] - w) <= 1e-3 * abs(w) for k, w in one.items())
-    ]
-    before, same = alike[0] if alike else given[0], bool(alike)
-    if same or (not own and not ends):
+    text = file.read_text(encoding="utf-8-sig")
+    document, made, new = tomlkit.parse(text), made_changes(text), dict[str, Any]()
+    reward, blank = document.get("reward", {}), dict[str, float]()
+    own, ends, written = (dict(reward.get(k, {})) for k in ("state", "terminal", "input_change"))
+
+    # weights that nobody chose are renewed, and with them those that were offered for the end
+    usual = {k: w for k, w in usual.items() if k in own or k not in ends}
+    alike = (one for one in (usual, dict.fromkeys(usual, 1.0)) if _alike(own, one))
+    before = next(alike, None)
+    if before is not None or not (own or ends):
+        old = usual if before is None else before
         ends = {
-            k: OFFERED * weights[k] if k in weights and _is_offered(w, before.get(k)) else w
+            k: OFFERED * weights[k]
+            if k in weights and k in old and _near(w, OFFERED * old[k])
+            else w
             for k, w in ends.items()
             if k in own or k not in left
         }
-        renewed: dict[str, Any] = {"state": _inline(weights)}
-        written = dict(reward.get("input_change", {}))
         blank = {
-            name: new
-            for name, (old, new) in changes.items()
-            if name in written and written[name] in (old, made.get(name))
+            name: with_limits
+            for name, (without, with_limits) in changes.items()
+            if name in written and written[name] in (without, made.get(name))
         }
-        if blank:
-            renewed["input_change"] = _inline(written | blank)
-        _put(document, "reward", renewed)
+        new = {"state": weights, "input_change": written | blank if blank else None}
     ends = {k: float(f"{w:.6g}") for k, w in (dict(terminal) | ends).items()}
     if ends != dict(reward.get("terminal", {})):
-        _put(document, "reward", {"terminal": _inline(ends)})
+        new["terminal"] = ends
+    _put(document, "task", {"target": name, "horizon": steps})
+    _put(document, "reward", new)
     text = tomlkit.dumps(document)
-    if same and own:
-        offered = _inline({name: float(f"{OFFERED * w:.6g}") for name, w in weights.items()})
-        text = OFFER.sub(f"# terminal = {offered.as_string()}", text)
+
+    # the comments that say what was offered, and what was written
+    if before and own:
+        offered = {name: float(f"{OFFERED * w:.6g}") for name, w in weights.items()}
+        text = OFFER.sub(f"# terminal = {as_toml(offered).as_string()}", text)
     if made and blank:
-        text = MADE.sub(f"# input_change = {_inline(made | blank).as_string()}", text)
+        text = MADE.sub(f"# input_change = {as_toml(made | blank).as_string()}", text)
     write_atomically(file, text.encode())
 
 
@@ -290,31 +298,9 @@ def made_changes(text: str) -> dict[str, float]:
     return {}
 
 
-def _is_offered(terminal: float, weight: float | None) -> bool:
-    """Return whether a weight at the end is what `init` or `target --rest` offer beside another."""
-    return weight is not None and abs(terminal - OFFERED * weight) <= 1e-3 * OFFERED * weight
+def _alike(own: Mapping[str, float], weights: Mapping[str, float]) -> bool:
+    return own.keys() == weights.keys() and all(_near(own[k], w) for k, w in weights.items())
 
 
-def _change(file: Path, where: str, changes: Mapping[str, Any]) -> None:
-    import tomlkit
-
-    document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
-    _put(document, where, changes)
-    write_atomically(file, tomlkit.dumps(document).encode())
-
-
-def _put(document: Any, where: str, changes: Mapping[str, Any]) -> None:
-    import tomlkit
-
-    table: Any = document.setdefault(where, tomlkit.table())
-    table.update({name: value for name, value in changes.items() if value})
-    for name in [name for name, value in changes.items() if not value]:
-        table.pop(name, None)  # an empty value is equivalent to a missing key
-
-
-def _inline(values: Mapping[str, Any]) -> Any:
-    import tomlkit
-
-    table = tomlkit.inline_table()
-    table.update(dict(values))
-    return table
+def _near(one: float, weight: float) -> bool:
+    return abs(one - weight) <= 1e-3 * abs(weight)
