@@ -10,6 +10,7 @@ from grounded.model import Model
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening.estimating import EstimateTable, with_estimates
+from grounded_trials.workspace.user_files.config import set_keys
 from workspaces import CONFIG, make
 
 TABLE = EstimateTable({"x": 0.002}, {})
