@@ -70,7 +70,7 @@ FILE: dict[str, Entry] = {
     ),
     # files and folders
     "missing": refuse(
-        "{about} does not exist[[, nor does its folder {folder}]][[: did you mean '{near}'?]]",
+        "{about} does not exist[[, nor does its folder {folder}]][[: did you mean '{near}'?]]"
     ),
     "no_workspace": refuse(
         "there is no {about}, which a workspace has",
@@ -116,8 +116,8 @@ FILE: dict[str, Entry] = {
     # times of a log's signals
     "gap": refuse(
         "'{about}' ({path}) is not known[[ at {at} s]][[, only from {first} s to {last} s]][[ "
-        "from {start} s to {end} s after the start, more than {limit:.3f} s]][[ in each control "
-        "step of {dt:.3g} s: it comes every {every:.3g} s]]",
+        "from {start} s to {end} s after the start]][[ in each control step of {dt:.3g} s: it "
+        "comes every {every:.3g} s]]",
         "end the span before that, or set max_age_s[[dt? ; if its times are milliseconds, name "
         "the column t_ms]]",
     ),
@@ -130,7 +130,7 @@ FILE: dict[str, Entry] = {
     "steps": refuse(
         "the trial would have {steps} steps of {dt:g} s, from {start:.3f} s to {stop:.3f} s[[; "
         "samples come every {every:.3g} s: are the times in another unit than their column says?]]",
-        "see [log.span]",
+        "see [log.span][[every? and the unit of the times]]",
     ),
     # what is odd in a log
     "staircase": warn(
@@ -143,10 +143,9 @@ FILE: dict[str, Entry] = {
         "{high:.4g}",
     ),
     "vanished": warn(
-        "[[{about} {about:has/have} no sample after {until:.2f} s of the log, in which other "
-        "states go on until {whole:.2f} s: the trial ends there]][[{about} is not a finite number "
-        "at {ends}: the trial ends there]][[all states are known from {late:.3f} s on: the trial "
-        "starts there]]",
+        "[[{about} {about:has/have} no sample after {until:.2f} s of the log: the trial ends "
+        "there]][[{about} is not a finite number at {ends}: the trial ends there]][[all states "
+        "are known from {late:.3f} s on: the trial starts there]]",
     ),
     "odd_values": warn(
         "{about}:[[ only {messages:message}]][[ only its first {first:number} are listed]][[ "
@@ -154,7 +153,7 @@ FILE: dict[str, Entry] = {
         "repeated or 0]][[ held from a single sample{single:1=}]][[, the largest gap is {gap}]]",
     ),
     "opposite": warn(
-        "{about} show the same motion with OPPOSITE SIGN, correlation {correlation:.3f}",
+        "{about} show the same motion with OPPOSITE SIGN, correlation {correlation:.3f}"
     ),
     # what is lost
     "cut": warn(
@@ -236,7 +235,7 @@ GIVEN: dict[str, Entry] = {
 START: dict[str, Entry] = {
     # why a number of the log is a state or input
     "unit": note(
-        "{about:its/their} unit is {unit}[[ in the log, {model} in the model]][[size? , by size]]",
+        "{about:its/their} unit is {unit}[[ in the log, {model} in the model]][[size? , by size]]"
     ),
     "joint": note(
         "[[{index} of ]]{about} is its joint[[ '{joint}']][[index? , in order from the base: "
@@ -255,9 +254,7 @@ START: dict[str, Entry] = {
         "no name matches; {numbers} {numbers:is/are} left[[only? , by unit]][[!only? , in the "
         "log's order]]",
     ),
-    "steps": note(
-        "with it the model's steps fit {share:%} better than the next best",
-    ),
+    "steps": note("with it the model's steps fit {share:%} better than the next best"),
     "given": note("as you specified"),
     "unused": note("{about} {about:is/are} not used of the log: [log] can name {about:it/them}"),
     "angles": note(
@@ -310,7 +307,7 @@ START: dict[str, Entry] = {
 # a manoeuvre that was drawn
 TARGET: dict[str, Entry] = {
     "readings": note(
-        "the sensor of {about} reads {bias}, and the target is in its readings; it ends at {end}",
+        "the sensor of {about} reads {bias}, and the target is in its readings; it ends at {end}"
     ),
     "start": note(
         "[task] start is where {about} rests: {start}",

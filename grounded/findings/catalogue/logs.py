@@ -71,7 +71,7 @@ LOG: dict[str, Entry] = {
         "{about} acts the other way round than in {others} ({share:%} of its modelled effect, "
         "there {usual:%}): no model explains both[[ (in {which})]]",
         "was a motor wired otherwise, or a sign switched? Then mend it[[, discard {trials}]] and "
-        "run again; if only the log has the other sign, correct that",
+        "run again",
     ),
     "zero": refuse(
         "{about} is {off} too {size} for the commands of {ran}: does its zero differ from that of "
@@ -80,28 +80,24 @@ LOG: dict[str, Entry] = {
     ),
     # columns: what [log] and names say
     "path": warn(
-        "{about} is read from {path}, {what}[[: {instead} is the angle]]",
-        "check its path in [log]",
+        "{about} is read from {path}, {what}[[: {instead} is the angle]]", "check its path in [log]"
     ),
     "stated": warn(
         "{about} is read without a scale from a column in {unit}, but the model has {own}",
         "set scale = {by:.6g} in {table}, if so",
     ),
     "unread": note(
-        "{about} is in [log], but not in [estimate] measured: the trial has an estimate in its "
-        "place",
+        "{about} is in [log], but not in [estimate] measured: an estimate is used",
         "to use it, add {about} = its scatter at standstill there",
     ),
     "limits": warn(
-        "{about} goes [[from {logged}]][[up to {most}]] beyond its [limits][[, {limits}]] in this "
-        "log",
+        "{about} goes [[from {logged}]][[up to {most}]] beyond its [limits][[, {limits}]]",
         "[[most? log the commands after clipping]][[{how:flip=its scale in [log] is negative: "
-        "multiply these limits by -1 too,widen=no plan will use that: widen them if the robot can "
-        "take it}]]",
+        "multiply these limits by -1 too,widen=widen them if the robot can take it}]]",
     ),
     # what a log lacks
     "gaps": warn(
-        "{samples} lost samples were interpolated, the longest gap is {longest} of {about} at {at}",
+        "{samples} lost samples were interpolated, the longest gap is {longest} of {about} at {at}"
     ),
     "short": warn(
         "the log ends after {steps} of {horizon} steps[[, {missing:.3g} ms before the plan's last "
@@ -121,8 +117,7 @@ LOG: dict[str, Entry] = {
     "from": note(
         "it is used from {at:.3f} s on, as if {name} had been {value:.4g} before: what was sent "
         "before the log is not in it",
-        "if {name} was 0, add a row before it that says so, or ingest it with `--before "
-        "{name}=0`: it then begins with the step, from which a delay or a lag can be told",
+        "if {name} was 0, add a row before it that says so, or ingest it with `--before {name}=0`",
     ),
     "start_doubt": warn(
         "where {ran} begins is in doubt: its commands fit as well from {rival:.3f} s of the log "
@@ -140,8 +135,7 @@ LOG: dict[str, Entry] = {
     ),
     "begun_late": refuse(
         "its first row is {late} after {ran} began",
-        "record from before the run: without its beginning it can't be judged. If nothing was cut "
-        "off, the program's clock began before the run",
+        "record from before the run: without its beginning it can't be judged",
     ),
     # whose run it is
     "not_run": refuse(
@@ -153,8 +147,7 @@ LOG: dict[str, Entry] = {
     ),
     "silent": refuse(
         "{about} {about:is/are} 0 from the first step to the last, unlike in the plan of {ran}",
-        "were the commands recorded? If they were, pass `runner.action` the seconds since the run "
-        "began",
+        "were the commands recorded? If so, pass `runner.action` the seconds since the run began",
     ),
     "another": refuse(
         "its commands are those of {other}, not of {ran}[[: to {theirs:%}, of {ran} only to "
@@ -194,10 +187,9 @@ LOG: dict[str, Entry] = {
         "is run a second time from now on}]]",
     ),
     "stored": refuse(
-        "{about} is stored already, as {trial}[[ ({used})]][[other?, read in another way (another "
-        "[log], [estimate], [task] dt or --before)]]",
-        "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted} all the "
-        "same, discard {trial} and ingest it again]][[other? discard {trial} and ingest it again]]",
+        "{about} is stored already, as {trial}[[ ({used})]][[other?, read in another way]]",
+        "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted}, "
+        "discard {trial} and ingest it again]][[other? discard {trial} and ingest it again]]",
     ),
     "not_estimated": refuse(
         "the smoother finds no finite states for this log ({why})",
@@ -206,10 +198,9 @@ LOG: dict[str, Entry] = {
     "no_signal": refuse(
         "[log] maps no '{about}'{what:any=, nor any other state,estimated=, but [estimate] lists "
         "it as measured}",
-        "{what:input=every input must be logged: map it,any=map what is measured,estimated=map "
-        "it, or remove it there,state=map it, or let a smoother estimate it}[[ ({path} has "
-        "{numbers})]][[, with the noise of each measured state under [estimate]: measured = "
-        "{measured}]]",
+        "{what:input=map it,any=map what is measured,estimated=map it, or remove it "
+        "there,state=map it, or let a smoother estimate it}[[ ({path} has {numbers})]][[, with "
+        "[estimate] measured = {measured}]]",
     ),
 }
 
@@ -224,8 +215,8 @@ RUN: dict[str, Entry] = {
     ),
     "unfed": aside(
         "its commands are the feed-forward of {ran} alone, without its feedback",
-        "send what `runner.action(t, state)` returns, for a state that holds numbers only "
-        "(`runner.blind` counts the calls without), and run {ran} again",
+        "send what `runner.action(t, state)` returns, for a state of numbers only, and run {ran} "
+        "again",
         hides=SPOILT,
     ),
     "origin": aside(
@@ -277,8 +268,7 @@ RUN: dict[str, Entry] = {
     "skipped": aside(
         "its commands change every {every:.3g} ms, dt is {dt:.3g} ms: {lost:%} of the steps of "
         "{ran} were not run, or not logged",
-        "call the runner every {dt:.3g} ms, log every command and run {ran} again; or set [task] "
-        "dt to what the robot can",
+        "call the runner every {dt:.3g} ms, log every command and run {ran} again",
         hides=OUTCOME,
     ),
     # the robot
@@ -286,9 +276,8 @@ RUN: dict[str, Entry] = {
         "{about} acted the other way round[[: so the model predicts {state} {times:.2g} times as "
         "well]][[, with -{share:%} of its modelled effect]][[, unlike in {others}]][[, as in "
         "{alike}]]",
-        "is it wired the wrong way round, or its sign wrong in the model or the log[[ ({column} "
-        "reads another column now)]]? Then[[ `discard {trial}`,]] mend it and run again; "
-        "otherwise `propose` goes on",
+        "is it wired the wrong way round, or its sign wrong in model or log[[ ({column})]]? "
+        "Then[[ `discard {trial}`,]] mend it and run again; otherwise `propose` goes on",
         hides=(*OUTCOME[1:], "log.limits"),
     ),
     "astray": aside(
@@ -298,17 +287,14 @@ RUN: dict[str, Entry] = {
     ),
     "early": aside(
         "all states are known for {steps} of {horizon} steps only[[, {silent} not after that]]; "
-        "the robot was as near to its prediction there as before[[ ({ran} ran to the end in "
-        "{complete})]]: was the recording cut off, or the robot stopped?",
+        "until then it ran as predicted: was the recording cut off, or the robot stopped?",
         "`discard {trial}` and run {ran} again; if it crashed, `propose` goes on",
         hides=SPOILT[3:],
     ),
     "failed": warn(
         "the run ended after {steps} of {horizon} steps[[large? , with values that are too "
-        "large]]: a failed candidate[[ ({silent} unknown after that)]][[, though {complete} ran "
-        "to the end]]",
-        "[[`discard {trial}` if you stopped it for another reason, or if only the recording was "
-        "cut]]",
+        "large]]: a failed candidate[[ ({silent} unknown after that)]]",
+        "[[`discard {trial}` if you stopped it, or if only the recording was cut]]",
     ),
     "fell": warn(
         "{about} left [safety] {bound} at {at} (it was {was}, {predicted} was predicted), and "
@@ -316,24 +302,20 @@ RUN: dict[str, Entry] = {
         "if something disturbed it, `discard` it",
         hides=("run.early", "run.failed", "run.safety"),
     ),
-    "asked": aside(
-        "it did not run {ran} as it should, as `ingest` told",
-        ANEW,
-    ),
+    "asked": aside("it did not run {ran} as it should, as `ingest` told", ANEW),
     # its start
     "start_spoils": aside(
         "the run started with {state} = {began}, the task's start is {start}: {off} off, more "
         "than its noise[[; by the model its whole start changes its utility by {change:+.3g}]]",
-        "`discard {trial}`, place the robot nearer and run {ran} again; if it can't be placed "
-        "nearer, `propose` goes on; if it always starts there, set it in [task] start",
+        "`discard {trial}`, place the robot nearer and run {ran} again; if it always starts "
+        "there, set it in [task] start; else `propose` goes on",
         hides=SPOILT,
     ),
     "start": warn(
         "the run started with {state} = {began}, the task's start is {start}: {off} off[[, as "
         "those of {runs} other runs, off by {rms} (rms)]][[; by the model that changes its "
         "utility by {change:+.3g}]]: the run counts",
-        "place the robot nearer to the start next time, or write in [task] start where it always "
-        "starts, and propose again",
+        "place the robot nearer to the start, or write in [task] start where it always starts",
     ),
     # its end
     "safety": warn(
@@ -352,8 +334,7 @@ RUN: dict[str, Entry] = {
         "[[what it wrote is kept in {kept}]]",
     ),
     "workers": refuse(
-        "{lost} of {total:job} lost their worker ({why})",
-        "run the study again with fewer --jobs",
+        "{lost} of {total:job} lost their worker ({why})", "run the study again with fewer --jobs"
     ),
     "viewer": refuse(
         "the viewer [[did not start, with exit code {exit}]][[missing? is not "
@@ -377,7 +358,7 @@ SENSOR: dict[str, Entry] = {
     ),
     "derived": note(
         "is a filtered derivative of {of}, {age:.2g} s behind it on average; left out of the "
-        "diagnosis: it tells nothing more than {of}",
+        "diagnosis",
     ),
     "scale": warn(
         "shows [[{share:%} of]][[{size} {way} than]] the rate of {of}[[rpm? , 2 pi / 60 times it: "
@@ -388,9 +369,7 @@ SENSOR: dict[str, Entry] = {
         "single samples]][[has a new value only every {every:.3g} s]][[sticks to its last value, "
         "up to {stuck:.3g} s at a time, and then jumps]][[ ({share:%})]]",
     ),
-    "mismatch": warn(
-        "does not move as {of} {of:implies/imply} (its rate is off by {off})",
-    ),
+    "mismatch": warn("does not move as {of} {of:implies/imply} (its rate is off by {off})"),
     "unresolved": warn(
         "reaches {reach} in {trial}: from {at} on, the model can't be integrated with time steps "
         "of {step}, and the rest of that trial is left out",
@@ -400,8 +379,7 @@ SENSOR: dict[str, Entry] = {
         "{about} can be mended for good",
         "[[the program that writes the trials should {how:late=read it with less delay or filter "
         "it less,sign=flip its sign,degrees=write it in the model's unit}]][[treat it as {of}: "
-        "]][[if the robot's program gets it as late as this log does, `adopt` sensor_delay, and "
-        "the plan allows for it; else set {log} in its table of [log]; not both]][[fed? ; the "
-        "runner's feedback gets it late as well]]",
+        "]][[if the robot's program gets it as late, `adopt` sensor_delay; else set {log} in its "
+        "table of [log]; not both]]",
     ),
 }

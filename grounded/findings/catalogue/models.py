@@ -19,8 +19,7 @@ MODEL: dict[str, Entry] = {
     "unmeasured": note("{about} {about:was/were} never measured"),
     "share": note(
         "of {total:,} [[stretches? stretches]][[!stretches? steps]] {used:,} were used[[, in "
-        "{kept} of {trials} trials]][[first?, the first of each]][[stretches?, those with most "
-        "motion]]",
+        "{kept} of {trials} trials]][[stretches?, those with most motion]]",
     ),
     "copy": warn("{about} equals {first}: a copy, or no noise at all; it counts once"),
     # its parameters
@@ -77,7 +76,7 @@ MODEL: dict[str, Entry] = {
     "other_form": refuse(
         "{about} can't be written: the model comes from [[{source}, which stays as it "
         "is]][[!source? no file of its own]]",
-        "name another file with the ending of an MJCF, URDF or Python file that model.py names",
+        "name a file with the ending of the one that model.py names",
     ),
     # what can't be adopted, or undone
     "not_adoptable": refuse(
@@ -100,15 +99,14 @@ MODEL: dict[str, Entry] = {
     ),
     "not_finite": refuse(
         "the predictions of {about} are not finite[[: {trial}, t = {at}, {values}]]",
-        "[[!at? fit its parameters, or check their units]][[at? noise can carry a logged value "
-        "outside the domain of a square root or a logarithm: bound the argument in the model "
-        "(np.maximum(x, 0))]]",
+        "[[!at? fit its parameters, or check their units]][[at? bound the argument of a square "
+        "root or a logarithm in the model (np.maximum(x, 0))]]",
     ),
     "differs": refuse(
         "{about}: the [[!by? trace]][[by? jacobian]] of '{state}' differs from the function[[, "
         "{ours} and {own}]][[ by '{by}', by {off:.3g}]]",
-        "[[by? leave jacobian out to difference the step]][[!by? does it use random numbers, keep "
-        "a memory, or look at the type of its arguments?]]",
+        "[[by? leave jacobian out to difference the step]][[!by? does it use random numbers, a "
+        "memory, or the type of its arguments?]]",
     ),
     "undefined": refuse(
         "{about} does not define `model = Model(...)`",
@@ -142,7 +140,7 @@ GAP: dict[str, Entry] = {
         "cause]][[left?; a gap remains beside this]]",
     ),
     "none": note(
-        "the model explains these trials[[known?  down to the noise]][[adopted?  as adopted]]",
+        "the model explains these trials[[known?  down to the noise]][[adopted?  as adopted]]"
     ),
     "unknown": note(
         "no known effect explains what the model leaves[[noise?, which may be noise]][[groups?  "
@@ -175,26 +173,25 @@ GAP: dict[str, Entry] = {
         "[[own?adopting writes {effect}]]",
     ),
     "equivalent": note(
-        "no log can tell {effect} from {others} in this model; plans are the same for all",
+        "no log can tell {effect} from {others} in this model; plans are the same for all"
     ),
     "worse": warn(
         "predictions of {state} get worse [[{ahead:.3g} s ahead]][[whole? over whole trials]]: "
         "{now:size} instead of {before:size}",
     ),
     "disagree": warn(
-        "the trials disagree on {quantity} of {effect}: {low} in {trial}, {high} in {trial2}",
+        "the trials disagree on {quantity} of {effect}: {low} in {trial}, {high} in {trial2}"
     ),
     "one_motion": note("all trials repeat one motion: these values may not hold for another"),
     "unconfirmed": note(
-        "unconfirmed: {effect} ({values}), which {seen} of {trials} trials show, all of one group",
+        "unconfirmed: {effect} ({values}), which {seen} of {trials} trials show, all of one group"
     ),
     "small": note(
         "{state} is off by {error:size} [[{ahead:.3g} s ahead]][[whole?over whole trials]], "
-        "{times:.2g} times the noise but {share:%} of the error before: too little to find a cause",
+        "{times:.2g} times the noise: too little to find a cause",
     ),
     "noise": note(
-        "how much of the error of {state} is noise is not known",
-        "repeat one run to know it",
+        "how much of the error of {state} is noise is not known", "repeat one run to know it"
     ),
     "correction": note(
         "a curve over {over} predicts {gain:%} of what no effect explains: no cause, but "
@@ -210,10 +207,7 @@ GAP: dict[str, Entry] = {
         "flip its sign in model.py; if only the log has it so, multiply the scale in "
         f"[log.input.{{input}}] by -1 and ingest the logs again; {DIAGNOSE}",
     ),
-    "corrected": warn(
-        "corrected here, but not in the stored trials: {about}",
-        FIX,
-    ),
+    "corrected": warn("corrected here, but not in the stored trials: {about}", FIX),
     # the next step: one of them
     "next.record": note(
         "[[diagnose all: {stored:stored trial} of this task can be diagnosed as well]][[!stored? "
@@ -224,7 +218,7 @@ GAP: dict[str, Entry] = {
         "has ended, with {candidate}]]",
     ),
     "next.adopt": note(
-        "no trial is needed: adopt the claimed causes[[left?; a diagnosis after it may tell more]]",
+        "no trial is needed: adopt the claimed causes[[left?; a diagnosis after it may tell more]]"
     ),
     "next.doubt": note(
         "adopt nothing yet: {why:worse=predictions get worse,little=predictions gain "
@@ -237,12 +231,9 @@ GAP: dict[str, Entry] = {
     ),
     "next.flip": note(f"flip the sign of {{input}}, {DIAGNOSE}"),
     "next.apart": note(
-        "run a trial that may tell {effect} from {others}: small and large inputs of each sign, "
-        "slow and fast",
+        "run a trial that may tell {effect} from {others}: small and large inputs of each sign",
     ),
-    "next.confirm": note(
-        "run a trial of another motion or condition that shows {effect}",
-    ),
+    "next.confirm": note("run a trial of another motion or condition that shows {effect}"),
     "next.look": note(
         "look at the recording of {trial} from {start:.3g} to {end:.3g} s",
         "if the robot was held or pushed then, discard it and ingest its log without that part",
@@ -257,7 +248,7 @@ GAP: dict[str, Entry] = {
     ),
     "next.fix": warn(FIX),
     "next.probe": note(
-        "[[run {candidate}, ]]{probe}: expected to tell {effect} from {others} by {by:.3g} nats",
+        "[[run {candidate}, ]]{probe}: expected to tell {effect} from {others} by {by:.3g} nats"
     ),
     "no_probe": note(
         "no probe[[ ({why})]][[!why?: none that was tried stays inside [safety] and near the "

@@ -40,7 +40,7 @@ PLAN: dict[str, Entry] = {
         "as low as ran without oscillating]], {seconds}",
     ),
     "predicted": note(
-        "utility {utility}[[, about {log} in its log]][[, {noise} of it by sensor noise]]",
+        "utility {utility}[[, about {log} in its log]][[, {noise} of it by sensor noise]]"
     ),
     "so_far": note(
         "{utility} by {best}[[, {noise} of it by sensor noise]][[; for {best} itself the model "
@@ -59,8 +59,7 @@ PLAN: dict[str, Entry] = {
     ),
     "model": note("the model is {what}"),
     "lacks": note(
-        "the last diagnosis found that {cause}[[, and {more:cause} more]]",
-        "`{command}` first",
+        "the last diagnosis found that {cause}[[, and {more:cause} more]]", "`{command}` first"
     ),
     "no_target": refuse(
         "there is no manoeuvre to learn: [task] names no target",
@@ -128,7 +127,7 @@ PLAN: dict[str, Entry] = {
         "sees, or undo the adoption with `adopt --undo`",
     ),
     "other_task": refuse(
-        "{about} was made for another task[[ ({what})]][[never? , and was not run there]]",
+        "{about} was made for another task[[ ({what})]][[never? , and was not run there]]"
     ),
     "outdated": note(
         "the model was changed since {candidate} was made: its prediction is outdated"
@@ -179,9 +178,7 @@ SEARCH: dict[str, Entry] = {
         "[[!crashed? the first candidate is the model's own policy]][[{crashed} crashed: the next "
         "first policy is gentler]]",
     ),
-    "step": note(
-        "improve on {best} with {step}[[, since {crashed} crashed]]",
-    ),
+    "step": note("improve on {best} with {step}[[, since {crashed} crashed]]"),
     # it waits
     "waiting": note("{candidate} is waiting for {missing:trial}"),
     "in_doubt": note(
@@ -208,7 +205,7 @@ SEARCH: dict[str, Entry] = {
     ),
     # it has ended without one
     "used_up": note(
-        "{used} of {most} trials are used up[[; a candidate needs {needs}]] ([search] max_trials)",
+        "{used} of {most} trials are used up[[; a candidate needs {needs}]] ([search] max_trials)"
     ),
     "crashed": note(
         "the first policy crashed {crashes} times, although each was gentler: the model is too "
@@ -223,17 +220,13 @@ SEARCH: dict[str, Entry] = {
     "lost_in_row": note("{lost} steps in a row did not improve", MODEL),
     "crashes": note("{crashes} policies crashed in a row", MODEL),
     "far_off": note(
-        "{candidate} [[gave {real:.4g}]][[!real? failed]], but {promised:.4g} was predicted",
-        MODEL,
+        "{candidate} [[gave {real:.4g}]][[!real? failed]], but {promised:.4g} was predicted", MODEL
     ),
     "within_model": note(
-        "the model alone reaches {promised:.4g}, {by:.3g} more than the {real:.4g} of {best}",
-        MODEL,
+        "the model alone reaches {promised:.4g}, {by:.3g} more than the {real:.4g} of {best}", MODEL
     ),
     "diagnose": note(MODEL),
-    "adopt_first": note(
-        "a better model may gain more: adopt what this one lacks",
-    ),
+    "adopt_first": note("a better model may gain more: adopt what this one lacks"),
     # what status tells beside it
     "uncounted": note(
         "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "
@@ -259,8 +252,7 @@ SEARCH: dict[str, Entry] = {
         "dt]][[!unusable? workspace]][[; did you mean '{meant}'?]][[; there are: {known}]]",
     ),
     "no_trial": refuse(
-        "there is no trial to learn from",
-        "ingest runs of candidates, or other logs with --data",
+        "there is no trial to learn from", "ingest runs of candidates, or other logs with --data"
     ),
     "none_waits": refuse(
         "[[{log} does not say which candidate it ran, and ]]no candidate is waiting for a trial",
@@ -281,6 +273,6 @@ SEARCH: dict[str, Entry] = {
         "the model, different start states alone changed the cost by {start:%}]]",
     ),
     "lead": note(
-        "the scatter of runs, or where they began, may explain its lead on the model's own policy",
+        "the scatter of runs, or where they began, may explain its lead on the model's own policy"
     ),
 }
