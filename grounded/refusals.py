@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import Any
 
-from grounded.errors import GroundedError, alike
+from grounded.errors import COMPARED, GroundedError, alike
 from grounded.findings import Weight, found
 
-MOST_NAMES = 12  # most names listed in a message
+MOST_NAMES = 12  # most names listed in a message; of more the nearest ones
 
 
 def refused(code: str, *about: object, then: Any = None, **facts: Any) -> GroundedError:
@@ -68,9 +68,13 @@ def unknown(
 
 
 def near(name: str, valid: Iterable[str]) -> dict[str, Any]:
-    """Return the nearest valid name as the fact `near`, or all as `known`."""
+    """Return the nearest valid name as the fact `near`, or all, or the nearest, as `known`."""
     names = [str(one) for one in valid]
     if close := alike(name, names):
         return {"near": close}
-    more = [f"{len(names) - MOST_NAMES} more"] * (len(names) > MOST_NAMES)
-    return {"known": (*names[:MOST_NAMES], *more)}
+    if len(names) <= MOST_NAMES:
+        return {"known": tuple(names)}
+    from difflib import get_close_matches
+
+    some = get_close_matches(name, names[:COMPARED], n=MOST_NAMES // 3, cutoff=0.0)
+    return {"known": (*some, f"{len(names) - len(some)} more")}

@@ -1,4 +1,4 @@
-"""grounded adopt: add diagnosed effects to the model, or undo it."""
+"""grounded adopt, discard, restore: what is added to the model, and which trials count."""
 
 from __future__ import annotations
 
@@ -6,10 +6,18 @@ from collections.abc import Iterator
 from functools import partial
 
 from grounded_cli.console.options import misuse
-from grounded_cli.console.terminal import field, sentence, show, tell
-from grounded_cli.console.workspace import next_line, open_workspace
+from grounded_cli.console.terminal import (
+    field,
+    names_in,
+    next_line,
+    open_workspace,
+    sentence,
+    show,
+    tell,
+)
 from grounded_trials.wording import ALONE, moved
 from grounded_trials.workspace.adoption import Adopted, numbers_in
+from grounded_trials.workspace.discarding import SetAside
 
 DIGITS = 4  # of a parameter, at least
 
@@ -46,4 +54,29 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
         show(field(name, moved(were[name][0], value, unit, DIGITS), "  "))
     if undo:
         show(field("adopted", ", ".join(str(one["name"]) for one in done.effects) or "none"))
+    show(f"\n{next_line(done.then)}")
+
+
+def discard(trials: tuple[str, ...], why: str) -> Iterator[SetAside]:
+    """Set trials aside."""
+    done = open_workspace().discard(*names_in(",".join(trials)), why=why)
+    yield done
+    _tell(done)
+
+
+def restore(trials: tuple[str, ...]) -> Iterator[SetAside]:
+    """Use trials again."""
+    done = open_workspace().restore(*names_in(",".join(trials)))
+    yield done
+    _tell(done)
+
+
+def _tell(done: SetAside) -> None:
+    for name in done.trials:
+        if name not in done.unchanged:
+            show(f"{name} {'discarded' if name in done.discarded else 'counts again'}")
+        else:
+            show(f"{name}: nothing was changed")
+    for name, why in done.discarded.items():
+        show(field("discarded", f"{name}{why and ': ' + why}"))
     show(f"\n{next_line(done.then)}")

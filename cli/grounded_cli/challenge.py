@@ -10,8 +10,7 @@ from grounded.challenge import make, summary
 from grounded.engine import Engine
 from grounded.errors import NextCommand
 from grounded.refusals import refused
-from grounded_cli.console.terminal import bar, names_in, number, show, table
-from grounded_cli.console.workspace import typed
+from grounded_cli.console.terminal import bar, names_in, number, show, table, typed
 from grounded_trials.challenge import diagnose_cases, score_cases, undiagnosed, write_cases
 from grounded_trials.wording import count
 

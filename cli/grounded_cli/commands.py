@@ -15,7 +15,7 @@ from grounded import __version__
 from grounded.errors import GroundedError
 from grounded.refusals import unknown
 from grounded_cli.console.options import command, flag, in_workspace, parallel, table_layout
-from grounded_cli.console.workspace import given, next_line
+from grounded_cli.console.terminal import given, next_line
 from grounded_trials.wording import placed
 
 
@@ -138,7 +138,7 @@ def target() -> None:
     """
 
 
-@command(cli, "excite")
+@command(cli, "excite", "target")
 @option("--seconds", type=float, help="Its duration (5 to 40, until no parameter is weak).")
 def excite() -> None:
     """Write the drive to record first, before there is a target.
@@ -202,7 +202,7 @@ def following() -> None:
     """
 
 
-@command(cli, "discard")
+@command(cli, "discard", "adopt")
 @argument("trials", nargs=-1, required=True, metavar="TRIAL...")
 @option("--why", default="", metavar="TEXT", help="The reason; `status` shows it.")
 def discard() -> None:
@@ -213,7 +213,7 @@ def discard() -> None:
     """
 
 
-@command(cli, "restore", "discard")
+@command(cli, "restore", "adopt")
 @argument("trials", nargs=-1, required=True, metavar="TRIAL...")
 def restore() -> None:
     """Use a discarded trial again."""
@@ -329,7 +329,7 @@ def inspect() -> None:
     """
 
 
-@command(cli, "recover", workspace=False)
+@command(cli, "recover", "inspect", workspace=False)
 @argument("log", metavar="LOG")
 @option("-o", "--output", metavar="FILE", help="Default: LOG with -recovered in its name.")
 def recover() -> None:

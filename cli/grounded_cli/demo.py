@@ -15,8 +15,17 @@ from grounded.errors import NextCommand
 from grounded.refusals import refused
 from grounded.result import percent
 from grounded.search.standing import Standing
-from grounded_cli.console.terminal import field, number, progress, remark, say, show, stages
-from grounded_cli.console.workspace import located, next_line
+from grounded_cli.console.terminal import (
+    field,
+    located,
+    next_line,
+    number,
+    progress,
+    remark,
+    say,
+    show,
+    stages,
+)
 from grounded_cli.learn import narrated
 from grounded_cli.status import summary
 from grounded_trials import Workspace

@@ -19,8 +19,17 @@ from grounded.engine import Engine, cores
 from grounded.findings import Weight
 from grounded.refusals import wrong
 from grounded_cli.console.options import names_of
-from grounded_cli.console.terminal import field, names_in, show, stages, table, tell, tinted
-from grounded_cli.console.workspace import next_line, open_workspace
+from grounded_cli.console.terminal import (
+    field,
+    names_in,
+    next_line,
+    open_workspace,
+    show,
+    stages,
+    table,
+    tell,
+    tinted,
+)
 from grounded_cli.propose import show_extent
 from grounded_trials.wording import percent
 from grounded_trials.workspace.candidates.trust import extent_of

@@ -13,8 +13,7 @@ from grounded.findings.catalogue import WEIGHTS, codes, entry_of
 from grounded.findings.numbers import bare
 from grounded.models import car, pendulum
 from grounded.refusals import unknown
-from grounded_cli.console.terminal import field, show
-from grounded_cli.console.workspace import open_workspace
+from grounded_cli.console.terminal import field, open_workspace, show
 from grounded_trials.workspace.adopted import installed_effects
 
 

@@ -9,8 +9,7 @@ from grounded.diagnosis.parts import Estimate
 from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded_cli.console.options import misuse
-from grounded_cli.console.terminal import field, show, table, tell
-from grounded_cli.console.workspace import next_line, open_workspace
+from grounded_cli.console.terminal import field, next_line, open_workspace, show, table, tell
 from grounded_trials.workspace.candidates.exporting import Exported
 from grounded_trials.workspace.home.library import Shelved
 from grounded_trials.workspace.home.taking_home import TakenHome

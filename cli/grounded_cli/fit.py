@@ -14,13 +14,14 @@ from grounded_cli.console.options import names_of
 from grounded_cli.console.terminal import (
     field,
     lines,
+    next_line,
     number,
+    open_workspace,
     show,
     stages,
     table,
     tell,
 )
-from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import or_zero, shown
 from grounded_trials.workspace.fitting import Fitted
 

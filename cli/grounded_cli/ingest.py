@@ -10,8 +10,15 @@ from typing import Any
 from grounded.errors import NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded_cli.console.options import json_asked, values_by_name
-from grounded_cli.console.terminal import field, number, progress, show, tell
-from grounded_cli.console.workspace import next_line, open_workspace
+from grounded_cli.console.terminal import (
+    field,
+    next_line,
+    number,
+    open_workspace,
+    progress,
+    show,
+    tell,
+)
 from grounded_cli.propose import tell_proposed
 from grounded_trials.logs.log_files import logs_in
 from grounded_trials.workspace.intake.ingest import Ingested

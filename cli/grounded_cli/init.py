@@ -14,8 +14,16 @@ import click
 from grounded.findings import found as finding
 from grounded.result import listed
 from grounded_cli.console.options import json_asked, misuse
-from grounded_cli.console.terminal import LABEL, field, names_in, progress, sentence, show, tell
-from grounded_cli.console.workspace import next_line
+from grounded_cli.console.terminal import (
+    LABEL,
+    field,
+    names_in,
+    next_line,
+    progress,
+    sentence,
+    show,
+    tell,
+)
 from grounded_trials import Workspace
 from grounded_trials.formats.tables import Layout
 from grounded_trials.logs.inspection.guess import Guess, estimating

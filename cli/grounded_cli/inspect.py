@@ -1,13 +1,28 @@
-"""grounded inspect: show the contents of a log, and a [log] table for it."""
+"""grounded inspect, recover: what is in a log, and what is readable in a damaged one."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
-from grounded_cli.console.terminal import names_in, number, progress, remark, show, table
-from grounded_cli.console.workspace import given, next_line, typed
+from grounded.errors import NextCommand
+from grounded_cli.console.options import exits
+from grounded_cli.console.terminal import (
+    field,
+    given,
+    names_in,
+    next_line,
+    number,
+    progress,
+    remark,
+    say,
+    show,
+    table,
+    typed,
+)
 from grounded_trials.formats.tables import Layout
 from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
+from grounded_trials.logs.recover import Recovery, recover_log
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.wording import count, extent
 from grounded_trials.workspace.folder import Folder
@@ -78,3 +93,34 @@ def _what(found: Inspected) -> str:
     ran = found.report.meta.get("candidate", "")
     kinds = {TRIAL: f"trial{f' of {ran}' * bool(ran)}", CANDIDATE: "candidate"}
     return ", ".join(damaged + [text for form, text in kinds.items() if form == found.format])
+
+
+def recover(log: str, output: str | None) -> Iterator[Recovery]:
+    """Save the readable part of a damaged log."""
+    source = Path(log)
+    target = Path(output) if output else source.with_name(f"{source.stem}-recovered.mcap")
+    with progress(f"reading {log}"):
+        found = recover_log(source, target)
+    exits(0 if found.complete else 3)
+    yield found
+    for loss in found.losses:
+        say(field("lost", loss))
+    if found.complete:
+        show(field("lost", "nothing"))
+    saved = count(sum(found.messages.values()), "message")
+    show(field("saved", f"{saved} in {found.duration_s:.2f} s: {found.file}"))
+    for topic, kept in found.messages.items():
+        lost = found.lost_messages.get(topic, 0)
+        show(f"  {topic}: {kept}" + (f", {lost} lost" if lost else ""))
+    show(f"\n{next_line(_next(found))}")
+
+
+def _next(found: Recovery) -> NextCommand:
+    """Return what to do with the file."""
+    target = str(found.file)
+    if found.format == CANDIDATE:
+        return NextCommand("propose")
+    if found.format != TRIAL:
+        return NextCommand("inspect", (target,))  # which says how it is ingested
+    whole = all(one.facts.get("index") for one in found.findings)
+    return NextCommand("ingest", (target,) if whole else ("--data", target))

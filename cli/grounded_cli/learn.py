@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from grounded.findings import Finding, Weight
 from grounded.search.candidate import Candidate
 from grounded_cli.console.terminal import (
+    next_line,
     number,
+    open_workspace,
     progress,
     remark,
     say,
@@ -16,7 +18,6 @@ from grounded_cli.console.terminal import (
     tell,
     tinted,
 )
-from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_cli.status import summary
 from grounded_trials import Workspace
 from grounded_trials.workspace.candidates.proposing import Status

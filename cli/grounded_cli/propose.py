@@ -6,8 +6,16 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 
-from grounded_cli.console.terminal import LABEL, field, number, show, stages, tell
-from grounded_cli.console.workspace import next_line, open_workspace
+from grounded_cli.console.terminal import (
+    LABEL,
+    field,
+    next_line,
+    number,
+    open_workspace,
+    show,
+    stages,
+    tell,
+)
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.proposing import Proposed
 from grounded_trials.workspace.candidates.trust import Extent

@@ -11,8 +11,16 @@ from pathlib import Path
 
 from grounded.refusals import refused
 from grounded_cli.console.options import exits, json_asked
-from grounded_cli.console.terminal import progress, remark, say, show, sparkline, table
-from grounded_cli.console.workspace import next_line, open_workspace
+from grounded_cli.console.terminal import (
+    next_line,
+    open_workspace,
+    progress,
+    remark,
+    say,
+    show,
+    sparkline,
+    table,
+)
 from grounded_trials.report.report_text import report_text
 from grounded_trials.report.reporting import Report
 

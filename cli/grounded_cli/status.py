@@ -8,7 +8,9 @@ from collections.abc import Iterator
 from grounded_cli.console.options import exits
 from grounded_cli.console.terminal import (
     field,
+    next_line,
     number,
+    open_workspace,
     progress,
     remark,
     show,
@@ -16,7 +18,6 @@ from grounded_cli.console.terminal import (
     table,
     tell,
 )
-from grounded_cli.console.workspace import next_line, open_workspace
 from grounded_trials.wording import count, legend, wrapped
 from grounded_trials.workspace.candidates.proposing import Status
 from grounded_trials.workspace.verifying import Verified

@@ -13,8 +13,7 @@ import click
 
 from grounded.findings import found
 from grounded.refusals import wrong
-from grounded_cli.console.terminal import names_in, show_json, stdout_kept
-from grounded_cli.console.workspace import located
+from grounded_cli.console.terminal import located, names_in, show_json, stdout_kept
 
 F = TypeVar("F", bound=Callable[..., Any])
 _CODE = "grounded_cli.code"

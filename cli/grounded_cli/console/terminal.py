@@ -1,4 +1,4 @@
-"""Terminal output: optional colour, wrapped text, tables, progress on stderr, JSON without NaN."""
+"""Terminal output: colour, wrapped text, tables, progress on stderr, JSON; the workspace of -C."""
 
 from __future__ import annotations
 
@@ -13,13 +13,28 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from itertools import accumulate
-from typing import Any, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
+import click
+
+from grounded.errors import NextCommand
 from grounded.findings.finding import Finding, Weight
 from grounded.progress import duration
 from grounded.result import plain
-from grounded_cli.console.workspace import given
-from grounded_trials.wording import MARKS, columns, figure, glued, placed, wrapped
+from grounded_trials.wording import (
+    ELSEWHERE,
+    MARKS,
+    columns,
+    figure,
+    folded,
+    glued,
+    placed,
+    rendered,
+    wrapped,
+)
+
+if TYPE_CHECKING:
+    from grounded_trials import Workspace
 
 number = figure
 BARS = "▁▂▃▄▅▆▇█"
@@ -313,3 +328,48 @@ def sparkline(values: Sequence[float]) -> str:
     bars = (BARS[round((v - least) / span * 7)] if math.isfinite(v) else "x" for v in places)
     scale = figure(low) + f" to {figure(high)}" * (low < high) + ", logarithmic" * log
     return f"{''.join(bars)}  {scale}" + ", x: failed" * (len(known) < len(shown))
+
+
+# the option -C: a command's workspace, and the next command to type for it
+
+_KEY = "grounded_cli.folder"
+
+
+def located(ctx: click.Context, option: click.Parameter | None, folder: str | None) -> None:
+    """Note the folder of -C, or of a workspace that a command made, for its further commands."""
+    if folder is not None:
+        ctx.meta[_KEY] = folder
+
+
+def given() -> str | None:
+    """Return the folder of -C of the running command, or None if it was not given."""
+    ctx = click.get_current_context(silent=True)
+    return None if ctx is None else ctx.meta.get(_KEY)
+
+
+def open_workspace() -> Workspace:
+    """Open the workspace that -C names, at the command or before it.
+
+    Raises:
+        GroundedError: if its grounded.toml is missing or invalid.
+    """
+    from grounded_trials import Workspace  # only commands that have a workspace need it
+
+    return Workspace(given() or ".")
+
+
+def typed(then: NextCommand, folder: str | None = None) -> str:
+    """Format a command so that it works from the user's current folder.
+
+    Args:
+        then: the command.
+        folder: the workspace for its -C; None: that of the -C given to this command.
+    """
+    if folder is None and then.verb not in ELSEWHERE:
+        folder = given()
+    return rendered(then, folder)
+
+
+def next_line(then: NextCommand, folder: str | None = None) -> str:
+    """Return the last line of an output, `next: ...`, with the command to type next."""
+    return folded(typed(then, folder))
