@@ -31,11 +31,9 @@ from grounded_trials.store.store import Lost, Store, Stored, made_folder, write_
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.identity import (
     Noted,
-    StoredCandidate,
     StoredTrial,
     candidate_of,
     encoded,
-    grouped,
     named_apart,
     noted,
     sha256,
@@ -155,14 +153,15 @@ class Folder:
         for stored in self.store.list():
             try:
                 if known.why_aside(stored) is None:
-                    found.append(self._whole(stored))
+                    one, group = self._whole(stored), known.groups.get(stored.digest, "")
+                    found.append(one.changed(group=group) if group else one)
             except GroundedError as error:
                 errors.append(error)
                 broken.append(Lost(str(stored.path), str(error)))
         lost = (
             replace(one, file=Path(one.file).name) for one in (*broken, *known.gone(self.store))
         )
-        trials = named_apart([*grouped(found, known)], known, self.candidate_path)
+        trials = named_apart(found, known, self.candidate_path)
         return trials, tuple(lost), errors
 
     @cached_property
@@ -356,15 +355,16 @@ class Folder:
             why = unreadable(file, "its file is missing and no trial contains it")
             for read in self._sources(identity, trials):
                 try:
-                    found = StoredCandidate.of(read(), identity)
+                    data = read()
+                    made, meta = candidate_of(data, identity)
                     trial, known = ran.get(identity, ("", ""))
-                    if known and found.sha256 != known:
+                    if known and sha256(data) != known:
                         raise refused("file.changed", file, what="policy", lost=trial)
                 except GroundedError as error:
                     errors.append(why := error)
                     continue
-                if (found.kind, found.task) == ("search", self.task.hash):
-                    yield found.candidate
+                if (meta.get("kind"), meta.get("task")) == ("search", self.task.hash):
+                    yield made
                 break
             else:
                 errors.append(why)

@@ -77,21 +77,10 @@ class StoredTrial:
         """SHA-256 of the candidate file that it contains, "" for none."""
         return sha256(self.policy) if self.policy else ""
 
-
-@dataclass(frozen=True, eq=False)
-class StoredCandidate:
-    """A candidate with the kind, the task and the hash of its file."""
-
-    candidate: Candidate
-    kind: str  # search or probe
-    task: str  # the hash of its task
-    sha256: str  # of its file
-
-    @classmethod
-    def of(cls, data: bytes, identity: str) -> Self:
-        """Decode a candidate as `candidate_of`."""
-        candidate, meta = candidate_of(data, identity)
-        return cls(candidate, meta.get("kind", ""), meta.get("task", ""), sha256(data))
+    def changed(self, **about: Any) -> Self:
+        """Return it with another candidate or group."""
+        trial, measured = (replace(each, **about) for each in (self.trial, self.measured))
+        return replace(self, trial=trial, measured=measured)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,15 +150,6 @@ def sha256(data: bytes) -> str:
     return hashlib.sha256(data).hexdigest()
 
 
-def grouped(trials: Iterable[StoredTrial], known: Noted) -> Iterator[StoredTrial]:
-    """Yield the trials, each with the condition that the user named for it, if any."""
-    for one in trials:
-        if group := known.groups.get(one.stored.digest, ""):
-            trial, measured = (replace(each, group=group) for each in (one.trial, one.measured))
-            one = replace(one, trial=trial, measured=measured)
-        yield one
-
-
 def named_apart(
     trials: Sequence[StoredTrial], known: Noted, path_of: Callable[[str], Path]
 ) -> tuple[StoredTrial, ...]:
@@ -196,15 +176,12 @@ def named_apart(
         path = path_of(name)
         file = sha256(path.read_bytes()) if len({*several}) > 1 and path.is_file() else ""
         own[name] = file if file in {*several, *known.handed.get(name, ())} else several[0]
-    found = []
-    for one, ran in zip(trials, prints, strict=True):
-        if ran != own.get(one.trial.candidate, ran) and ran:
-            other = f"{one.trial.candidate}~{ran[:8]}"
-            trial, measured = (replace(t, candidate=other) for t in (one.trial, one.measured))
-            found.append(replace(one, trial=trial, measured=measured))
-        else:
-            found.append(one)
-    return tuple(found)
+    return tuple(
+        one.changed(candidate=f"{one.trial.candidate}~{ran[:8]}")
+        if ran and ran != own.get(one.trial.candidate, ran)
+        else one
+        for one, ran in zip(trials, prints, strict=True)
+    )
 
 
 def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
@@ -212,9 +189,9 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
 
     `candidate_of` knows these bytes from then on: the process that wrote a file need not decode it.
     """
-    values = vars(candidate) | {"task": task.hash}
+    values = vars(candidate) | {"task": task.hash, "seen": ",".join(candidate.seen)}
     meta = {"kind": kind} | {
-        name: repr(float(values[name])) if of is float else _text(values[name])
+        name: repr(float(values[name])) if of is float else str(values[name])
         for name, of in _FIELDS.items()
     }
     data, table = encoded_candidate(
@@ -225,16 +202,8 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
         state_units=dict(task.model.states),
         input_units=dict(task.model.inputs),
     )
-    _keep(data, candidate, table)
+    _DECODED[sha256(data), candidate.id] = candidate, table
     return data
-
-
-def _keep(data: bytes, candidate: Candidate, meta: dict[str, str]) -> None:
-    _DECODED[sha256(data), candidate.id] = candidate, meta
-
-
-def _text(value: object) -> str:
-    return ",".join(value) if isinstance(value, tuple) else str(value)
 
 
 def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
@@ -249,7 +218,7 @@ def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]
     """
     key = sha256(data), identity
     if key not in _DECODED:
-        _keep(data, *_decoded(data, identity))
+        _DECODED[key] = _decoded(data, identity)
     candidate, meta = _DECODED[key]
     return candidate, dict(meta)
 

@@ -157,15 +157,8 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
             for line, row in enumerate(reader, start=2):
                 if len(rows) > ROW_LIMIT:
                     raise unreadable(path.name, f"> {ROW_LIMIT} rows")
-                try:
-                    values = [*map(float, row)]
-                except ValueError:
-                    values = []
-                if len(values) != len(names) or not math.isfinite(sum(values)):
-                    if not any(cell.strip() for cell in row):
-                        continue
-                    values = _numbers(path, line, names, row, free)
-                rows.append(values)
+                if any(cell.strip() for cell in row):
+                    rows.append(_numbers(path, line, names, row, free))
     except FileNotFoundError:
         raise refused("file.missing", path, where="[task] target") from None
     except IsADirectoryError:
