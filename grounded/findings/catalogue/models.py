@@ -213,10 +213,7 @@ GAP: dict[str, Entry] = {
         "[[diagnose all: {stored:stored trial} of this task can be diagnosed as well]][[!stored? "
         "run another trial, or record a longer log, in which every input changes]]",
     ),
-    "next.none": note(
-        "no trial is needed[[adopted?: nothing more is found]][[ for the manoeuvre: the search "
-        "has ended, with {candidate}]]",
-    ),
+    "next.none": note("no trial is needed[[adopted?: nothing more is found]]"),
     "next.adopt": note(
         "no trial is needed: adopt the claimed causes[[left?; a diagnosis after it may tell more]]"
     ),

@@ -13,7 +13,6 @@ import numpy as np
 from grounded.accounts.finding import in_the_log
 from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.error_report import open_noise
 from grounded.diagnosis.parts import Estimate, Made, Ranked
 from grounded.diagnosis.telling import NEXT
 from grounded.errors import GroundedError, NextCommand
@@ -28,7 +27,6 @@ from grounded_trials.workspace.adopted import installed_effects
 from grounded_trials.workspace.adoption import diagnosed_again
 from grounded_trials.workspace.candidates.handover import outside_limits
 from grounded_trials.workspace.candidates.search_state import (
-    candidate_named,
     overtaken,
     standing_in,
 )
@@ -42,7 +40,6 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.next_step import (
     DIAGNOSE,
-    EXPORT,
     after_diagnosis,
 )
 from grounded_trials.workspace.readings import one_message
@@ -167,16 +164,7 @@ def _with_next(
         found = found.asking(finding("gap.next.record", stored=left))
     write_diagnosis(workspace.reports, found)  # again, now with the next step
     then = DIAGNOSE if unasked else after_diagnosis(workspace, found)
-    then = NextCommand("discard", wrong) if wrong else then
-    if then == EXPORT and _left_open(found):
-        best = candidate_named(workspace, "best")
-        found = found.asking(finding("gap.next.none", candidate=best), identity)
-    return replace(found, then=then)
-
-
-def _left_open(found: Diagnosis) -> bool:
-    """Return whether a diagnosis leaves something that noise is not known to explain."""
-    return found.kind != "none" or bool(open_noise(found.prediction_error))
+    return replace(found, then=NextCommand("discard", wrong) if wrong else then)
 
 
 def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
