@@ -24,7 +24,7 @@ from grounded_trials.workspace.adopted import settled
 from grounded_trials.workspace.adoption import keep, not_adopted
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import chosen, ids_of, readable_diagnosis
+from grounded_trials.workspace.last_diagnosis import chosen, readable_diagnosis
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.readings import one_message
@@ -103,9 +103,9 @@ def fit_in(
             nothing is written then.
     """
     planner, share, names = workspace.planner, chosen(workspace, trials), params
-    used = share.trials
+    used, ids = share.trials, tuple(trial.id for trial in share.trials)
     adopted, every = _adopted_delays(workspace), tuple(range(planner.plan.model.m))
-    rows, early = unsure_times(workspace.whole_trials(), ids_of(used))
+    rows, early = unsure_times(workspace.whole_trials(), ids)
     found = fit(
         planner.plan,
         [planner.lift(trial) for trial in used],
@@ -126,7 +126,7 @@ def fit_in(
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
-    fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids_of(used))
+    fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids)
     fitted = partial(fitted, rows_s=rows * bool(late), interpolated_s=early)
     if apply and found.worse:
         raise GroundedError(_worse(found), then=after_fit(workspace))

@@ -14,7 +14,7 @@ import re
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property, partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
@@ -41,7 +41,7 @@ from grounded_trials.workspace.identity import (
 )
 from grounded_trials.workspace.user_files.config import Config, read_config
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
-from grounded_trials.workspace.user_files.task_file import build_task, read_target
+from grounded_trials.workspace.user_files.task_file import build_task
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
@@ -74,7 +74,6 @@ class Folder:
         self.store = Store(self.folder / "trials", prefix="t")
         self.notes = Notes(self.folder / "trials")
         self.reports = self.folder / "reports"
-        self.read_target = cache(read_target)
 
     @property
     def address(self) -> str | None:
@@ -120,12 +119,12 @@ class Folder:
     @cached_property
     def task(self) -> Task:
         """The task with the crude model, in which trials are judged."""
-        return build_task(self.config, self.base_model, self.folder, self.read_target)
+        return build_task(self.config, self.base_model, self.folder)
 
     @property
     def origin(self) -> Task:
         """The task with the unchanged model of model.py: nothing fitted, nothing adopted."""
-        return build_task(self.config, self._written, self.folder, self.read_target)
+        return self.task.with_model(self._written)
 
     @cached_property
     def planner(self) -> Planner:
@@ -176,7 +175,6 @@ class Folder:
 
     def forget(self) -> Self:
         """Forget everything that was read, since files may have changed; return the folder."""
-        self.read_target.cache_clear()
         for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:
             vars(self).pop(name, None)
         return self

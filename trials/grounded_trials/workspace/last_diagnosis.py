@@ -85,11 +85,6 @@ def usable_ids(workspace: Folder) -> list[str]:
     return [log.id for log in logs if workspace.fits(log) and log.known_steps >= LEAST_STEPS]
 
 
-def ids_of(trials: Sequence[Trial]) -> tuple[str, ...]:
-    """Return the short names of trials."""
-    return tuple(trial.id for trial in trials)
-
-
 def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
     """Return the trials to fit or to diagnose, or a share of them.
 
@@ -103,7 +98,7 @@ def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
         GroundedError: if there is none, or one of those named can't be used.
     """
     used = diagnosable(workspace)
-    names = named_trials(workspace, names, ids_of(used))
+    names = named_trials(workspace, names, [trial.id for trial in used])
     share = share_of([trial for trial in used if not names or trial.id in names])
     guessed = {t.stored.id: t.meta.get("estimated", "").split(",") for t in workspace.trials()}
     measured: list[Trial] = []

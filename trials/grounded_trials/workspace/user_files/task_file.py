@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
@@ -24,24 +24,21 @@ from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.user_files.config import Config
 
-Reader = Callable[[Path], tuple[list[str], Array]]  # reads a target, as `read_target` does
 
-
-def build_task(config: Config, model: Model, folder: Path, read: Reader | None = None) -> Task:
+def build_task(config: Config, model: Model, folder: Path) -> Task:
     """Build the task that the files describe.
 
     Args:
         config: the checked grounded.toml.
         model: the model whose states and inputs the files name.
         folder: the folder of the files.
-        read: the function that reads the target; None: `read_target`.
 
     Raises:
         GroundedError: for a name that is not in the model, or sizes that do not fit; the message
             names the file and the key.
     """
     try:
-        return _build(config, model, folder, read or read_target)
+        return _build(config, model, folder)
     except GroundedError as error:
         raise error.at(config.file.name, unless="file") from None
 
@@ -61,7 +58,7 @@ def check_tables(config: Config, model: Model, rows: int) -> None:
     build_task(untracked, model, config.file.parent)
 
 
-def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
+def _build(config: Config, model: Model, folder: Path) -> Task:
     states, inputs = list(model.state_names), list(model.input_names)
     table = config.task
     known("state or input", table.start, [*states, *inputs], "the model", "[task] start")
@@ -70,7 +67,7 @@ def _build(config: Config, model: Model, folder: Path, read: Reader) -> Task:
     if not path.resolve().is_relative_to(folder.resolve()):
         raise wrong("[task] target", table.target, must="inside")
     if table.target:
-        target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon, read)
+        target, input_target = target_arrays(path, states, inputs, table.dt, table.horizon)
     else:
         target, input_target = np.full((table.horizon + 1, len(states)), np.nan), None
     first = np.where(np.isfinite(target[0]), target[0], 0.0)
@@ -194,12 +191,7 @@ def _numbers(
 
 
 def target_arrays(
-    path: Path,
-    states: list[str],
-    inputs: list[str],
-    dt: float,
-    horizon: int,
-    read: Reader | None = None,
+    path: Path, states: list[str], inputs: list[str], dt: float, horizon: int
 ) -> tuple[Array, Array | None]:
     """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None.
 
@@ -209,12 +201,11 @@ def target_arrays(
         inputs: the model's inputs, m.
         dt: control interval [s].
         horizon: control steps, H.
-        read: the function that reads the file; None: `read_target`.
 
     Raises:
         GroundedError: for an unknown column, too few rows, or times off the control grid.
     """
-    names, values = (read or read_target)(path)
+    names, values = read_target(path)
     for name in names[1:]:
         if name not in states and name not in inputs:
             there = [*states, *inputs]
