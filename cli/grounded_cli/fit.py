@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 from grounded.diagnosis.telling import instrument_lines
 from grounded.engine import Engine, cores
-from grounded.fit import Fit
-from grounded.fit.result import FittedValue
+from grounded.fit import Fit, FittedValue
 from grounded.result import listed
 from grounded_cli.console.options import names_of
 from grounded_cli.console.terminal import (

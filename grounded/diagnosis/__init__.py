@@ -3,9 +3,8 @@
 Read `diagnose` first; its docstring lists the stages. `parts` holds the result.
 
     likelihood/    likelihood of the trials under a hypothesis and its noise
-    hypotheses/    search for the effects: hypotheses are made, fitted and compared
+    hypotheses/    search for the effects: they are made, fitted and compared
     validation/    held-out prediction errors in units, and the decision what is claimed
-    writer         the result: facts, and `remarks` with the next step as findings
-    telling        what is told of it: lines, tables, findings and the next step
-    pictures       the result in figures
+    writer         the result: facts, and its findings with the next step
+    telling        what is told of it: lines, tables, findings, figures
 """

@@ -7,11 +7,11 @@ attribution       search for effects by evidence   (search, hypotheses, scan, re
 ruler             held-out prediction errors in the channels' units
 decide            choose the claim by the ruler, among hypotheses proposed by evidence  (choose)
 measured          errors, noise floor, credit of each cause, leftover; where the gap is
-claims            claimed effects with intervals, ties and look-alikes  (lookalike, certainty)
+claims            claimed effects with intervals, ties and look-alikes  (lookalike)
 identifiable      what the data determine of each value, and what only priors set
 leftover          structure that no effect explains, and a curve that predicts it
 agreement         agreement of the trials; changes between two groups of them
-writer            the result; remarks: its findings and the next step; telling: its lines
+writer            the result, its findings and the next step; telling: its lines
 """
 
 from __future__ import annotations

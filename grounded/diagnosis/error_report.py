@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from grounded.diagnosis.levels import ABOVE, FAR, HALF, MANY, SHOWS
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Quantity
 from grounded.result import Document, with_unit
-
-if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Agreement
 
 CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `Credit.of`
 # families of what arrives late, and the quantity that is a time [s]
@@ -172,27 +169,6 @@ class RulerRow(Document):
     def loses(self) -> bool:
         """Whether its errors grow, over all states."""
         return sum(self.changes.values()) > 0
-
-
-def gain(rows: Sequence[RulerRow], before: str, after: str) -> float:
-    """Return the log gain of one column of errors over another, over channels and horizons.
-
-    Args:
-        rows: rows of the table of prediction errors.
-        before: "outset", "crude", "calibrated" or "with_effects".
-        after: likewise.
-
-    Returns:
-        The sum of the log ratios; 0 without meaningful errors.
-    """
-    ratios = [
-        math.log(was / now)
-        for row in rows
-        for name, now in getattr(row, after).items()
-        if now > 0 and (was := getattr(row, before).get(name, 0)) > 0
-        if row.tells(name, before, after)
-    ]
-    return sum(ratios)
 
 
 def furthest(rows: Sequence[RulerRow]) -> RulerRow | None:
@@ -366,42 +342,6 @@ def lost_most(rows: Sequence[RulerRow]) -> tuple[RulerRow, str] | None:
         if row is not None and most > math.log(1 + SHOWS):
             return row, name
     return None
-
-
-def objection(
-    rows: Sequence[RulerRow],
-    agreement: Sequence[Agreement],
-    effects: Sequence[str],
-    ties: Sequence[Sequence[str]] = (),
-    left: Sequence[Remainder] = (),
-) -> Finding | None:
-    """Return why adopting the claimed effects is unwise; None if it is not.
-
-    It is if predictions lose more than they gain, or get worse somewhere while the trials disagree
-    about the effects' values; also if they gain little beside a gap that remains, and all of them
-    tie with others or the gap is wide.
-
-    Args:
-        rows: held-out prediction errors, a row per horizon.
-        agreement: whether the trials agree on each value.
-        effects: the claimed effects.
-        ties: groups of effects that further trials could tell apart.
-        left: the leftovers beside them.
-    """
-    if not effects:
-        return None
-    lost, row = lost_most(rows), furthest(rows)
-    if lost is not None and lost[0].loses:
-        return found("gap.next.doubt", *effects, why="worse")
-    gap, wide = any(one.above for one in left), any(one.wide for one in left)
-    tied = all(any(name in group for group in ties) for name in effects)
-    gains = [] if row is None else [*row.gains.values()]
-    if gap and (wide or tied) and gains and sum(gains) < SHOWS * len(gains):
-        return found("gap.next.doubt", *effects, why="little")
-    differ = {one.effect for one in agreement if not one.agrees} & {*effects}
-    if not differ or lost is None:
-        return None
-    return found("gap.next.doubt", *(name for name in effects if name in differ), why="disagree")
 
 
 def excess(rows: Sequence[RulerRow]) -> tuple[float, str, RulerRow] | None:

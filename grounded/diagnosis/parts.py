@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from html import escape
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 from grounded.accounts.finding import Finding as Fault
 from grounded.accounts.finding import late_effects
@@ -25,16 +25,16 @@ from grounded.diagnosis.error_report import (
     Remainder,
     RulerRow,
     Where,
-    objection,
+    furthest,
+    lost_most,
 )
-from grounded.diagnosis.pictures import gap_figures
-from grounded.diagnosis.telling import LINES, NEXT, instrument_lines, told
+from grounded.diagnosis.levels import SHOWS
+from grounded.diagnosis.telling import LINES, NEXT, gap_figures, instrument_lines, told
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
-from grounded.findings import Finding
+from grounded.findings import Finding, found
 from grounded.result import Document, figure, html_table, number, or_zero, seen, spread, with_unit
 
-Kind = Literal["effect", "several", "none", "unknown"]
 POWERS_FROM, MOST_DIGITS = 1e3, 6  # a value; significant digits of one
 UNKNOWABLE = (  # codes of what the trials can't show
     *("model.few", "model.still", "model.unmeasured", "model.share", "model.copy"),
@@ -51,7 +51,7 @@ class Verdict(Document):
     again once these are adopted. `limit`: the code of the finding for which no cause is named.
     """
 
-    kind: str  # one of `Kind`
+    kind: str  # "effect", "several", "none" or "unknown"
     effects: tuple[str, ...] = ()
     causes: tuple[str, ...] = ()
     parameters: tuple[str, ...] = ()
@@ -243,13 +243,12 @@ class Diagnosis(Document):
     agreement: tuple[Agreement, ...] = ()  # of the trials in each of these values
     changed: tuple[Changed, ...] | None = field(metadata=BRIEF, default=None)  # between two groups
     trials: int = 0
-    motions: int = field(metadata=BRIEF, default=0)  # number of groups
     groups: tuple[TrialGroup, ...] = ()  # trials that differ in motion or condition
     held_out: str = "no"  # what values were not fitted on: groups, trials, pieces of a log, no
     score: Score = field(default_factory=Score)
     steps: int = 0
     candidates: int = 0
-    made: Made | None = field(metadata=BRIEF | {"key": "diagnosed"}, default=None)  # in a workspace
+    made: Made = field(metadata={"key": "diagnosed"}, default_factory=Made)
     tracked: tuple[str, ...] = ()  # states that the task follows, the most important first
     findings: tuple[Finding, ...] = ()  # what is told of it, and the next trial
     probe: str = field(metadata=BRIEF, default="")  # candidate that separates tied explanations
@@ -281,11 +280,33 @@ class Diagnosis(Document):
         return {n: self.values(n) for n in self.acting or self.effects if n in own}
 
     @property
-    def contested(self) -> bool:
-        """Whether the claim should not be adopted, see `objection`."""
-        ties = [group for group in self.indistinguishable if group not in self.equivalent]
-        rows, left = self.prediction_error, self.leftover
-        return objection(rows, self.agreement, self.effects, ties, left) is not None
+    def separable(self) -> list[tuple[str, ...]]:
+        """The groups of indistinguishable effects that another trial may tell apart."""
+        return [group for group in self.indistinguishable if group not in self.equivalent]
+
+    @property
+    def doubt(self) -> Finding | None:
+        """Why adopting the claimed effects is unwise; None if it is not.
+
+        It is if predictions lose more than they gain, or get worse somewhere while the trials
+        disagree about the effects' values; also if they gain little beside a gap that remains, and
+        all of them tie with others or the gap is wide.
+        """
+        effects, why = self.effects, ""
+        if not effects:
+            return None
+        lost, row = lost_most(self.prediction_error), furthest(self.prediction_error)
+        gap, wide = any(one.above for one in self.leftover), any(one.wide for one in self.leftover)
+        tied = all(any(name in group for group in self.separable) for name in effects)
+        gains = [] if row is None else [*row.gains.values()]
+        differ = {one.effect for one in self.agreement if not one.agrees} & {*effects}
+        if lost is not None and lost[0].loses:
+            why = "worse"
+        elif gap and (wide or tied) and gains and sum(gains) < SHOWS * len(gains):
+            why = "little"
+        elif differ and lost is not None:
+            why, effects = "disagree", tuple(name for name in effects if name in differ)
+        return found("gap.next.doubt", *effects, why=why) if why else None
 
     @property
     def next_trial(self) -> str:
@@ -315,9 +336,9 @@ class Diagnosis(Document):
         Raises:
             GroundedError: if the diagnosis has no values of this effect.
         """
-        found = self.quantities
-        known("value of the effect", [effect], found, "this diagnosis")
-        return found[effect]
+        each = self.quantities
+        known("value of the effect", [effect], each, "this diagnosis")
+        return each[effect]
 
     @property
     def quantities(self) -> dict[str, dict[str, float]]:
@@ -347,7 +368,7 @@ class Diagnosis(Document):
 
         One that changed by less than its error is none if a bound cut it, or if it was 0.
         """
-        nominal = {} if self.made is None else self.made.nominal
+        nominal = self.made.nominal
 
         def tells(e: Estimate, was: float) -> bool:
             return abs(e.value - was) > e.std or not (e.stopped or was == 0)
@@ -363,11 +384,11 @@ class Diagnosis(Document):
     @property
     def conditions(self) -> dict[str, tuple[str, ...]]:
         """Parameters by what holds only if they are right: a calibrated parameter or an effect."""
-        found = {one.parameter: tuple(one.given) for one in self.identifiable if one.given}
+        rests = {one.parameter: tuple(one.given) for one in self.identifiable if one.given}
         for one in self.combinations:
             if one.rests_on:
-                found |= dict.fromkeys(one.values, tuple(one.rests_on))
-        return found
+                rests |= dict.fromkeys(one.values, tuple(one.rests_on))
+        return rests
 
     @property
     def jointly(self) -> set[str]:
@@ -383,16 +404,15 @@ class Diagnosis(Document):
             adopted: effects, as in [model] effects.
             params: the model's parameters, as in [model] params.
         """
-        made = self.made or Made()
-        now, then = _numbers(adopted, params), _numbers(made.adopted, made.params)
+        now, then = _numbers(adopted, params), _numbers(self.made.adopted, self.made.params)
         return tuple(name for name in self.effects if now.get(name) == then.get(name))
 
     @classmethod
     def from_json(cls, document: Any) -> Self:
         """Read what `to_json` wrote; findings of other versions are left out."""
-        found = super().from_json(document)
-        kept = (one for one in found.findings if one.printable and one.code not in LINES)
-        return replace(found, findings=tuple(kept))
+        read = super().from_json(document)
+        kept = (one for one in read.findings if one.printable and one.code not in LINES)
+        return replace(read, findings=tuple(kept))
 
     @property
     def sentence(self) -> str:

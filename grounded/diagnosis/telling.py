@@ -1,4 +1,4 @@
-"""told: a diagnosis as lines, a table of causes, findings and the next step.
+"""told: a diagnosis as lines, a table of causes, findings and the next step; its figures.
 
 Terminal, report, page, notebook and recording take all of it from here. The words stand in the
 catalogue (`gap`).
@@ -7,9 +7,11 @@ catalogue (`gap`).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import (
@@ -23,6 +25,7 @@ from grounded.diagnosis.error_report import (
     telling,
 )
 from grounded.diagnosis.levels import SHOWS
+from grounded.figures.figure import Figure, Panel, bars, curve, legend, panel
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
 from grounded.result import figure, measured, number, or_zero, percent, shown
@@ -91,8 +94,7 @@ def cause_table(diagnosis: Diagnosis) -> tuple[tuple[Cells, ...], Cells]:
 
 
 def _was(d: Diagnosis, name: str) -> str:
-    known = {} if d.made is None else d.made.nominal
-    return f", was {number(known[name])}" if name in known else ""
+    return f", was {number(d.made.nominal[name])}" if name in d.made.nominal else ""
 
 
 def _what(d: Diagnosis) -> Finding:
@@ -112,7 +114,7 @@ def _what(d: Diagnosis) -> Finding:
     if d.kind == "unknown":
         return found("gap.unknown", noise=not d.leftover, groups=bool(d.changed))
     known = row is not None and any(error > 0 for error in row.noise_floor.values())
-    adopted = bool(d.made and d.made.adopted)
+    adopted = bool(d.made.adopted)
     return found("gap.none", known=known and not excess(d.prediction_error), adopted=adopted)
 
 
@@ -197,7 +199,7 @@ def error_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     columns = columns_told(diagnosis)
     rows: list[Cells] = []
     for one in shown_rows:
-        when = "whole trial" if one.whole_trial else f"{one.horizon_s:.3g} s ahead"
+        when = WHOLE if one.whole_trial else f"{one.horizon_s:.3g} s ahead"
         for name, unit in one.unit_by_channel.items():
             known = not math.isnan(one.crude.get(name, math.nan))  # else it has no sensor
             if known and any(getattr(one, key).get(name) for key in columns):  # else it never moved
@@ -275,3 +277,72 @@ def values_of(row: Ranked) -> str:
     return ", ".join(
         f"{name} = {e.text if e.known else 'unknown'}" for name, e in row.params.items()
     )
+
+
+MOST_BARS = 12  # bars
+WHOLE = "whole trial"
+APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
+ROLES = {  # of the columns of prediction errors
+    "outset": "limit",
+    "crude": "model",
+    "calibrated": "step1",
+    "with_effects": "best",
+    "noise_floor": "other",
+}
+
+
+def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
+    """Return the figures of a diagnosis, most important first; none if no cause can be named."""
+    if diagnosis.no_cause:
+        return []
+    found = (accuracy_figure(diagnosis), credit_figure(diagnosis))
+    return [figure for figure in found if figure is not None]
+
+
+def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
+    """Return the prediction errors without and with the diagnosis, in each state's unit."""
+    errors = diagnosis.prediction_error
+    if not errors:
+        return None
+    panels = _over_horizons(errors, columns_told(diagnosis))
+    if not panels:
+        return None
+    caption = "" if errors[0].held_out != "no" else "not held out"
+    key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
+    return Figure("accuracy", "Predictions before and after", caption, panels, key)
+
+
+def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> list[Panel]:
+    """Return one panel per state: its error over the horizon, and apart, that of whole trials."""
+    units = errors[0].unit_by_channel
+    panels: list[Panel] = []
+    apart = APART_BY * max((e.horizon_s for e in errors if not e.whole_trial), default=1.0)
+    at = np.array([apart if e.whole_trial else e.horizon_s for e in errors])
+    whole = np.array([e.whole_trial for e in errors])
+    ticks = [
+        (float(x), WHOLE.replace(" ", "\n") if w else f"{x:.3g}")
+        for x, w in zip(at, whole, strict=True)
+    ]
+    for channel, unit in units.items():
+        curves = []
+        for key, name in columns.items():
+            values = np.array([getattr(e, key).get(channel, math.nan) for e in errors], float)
+            for rows, note in ((~whole, ""), (whole, WHOLE)):
+                if (values[rows] > 0).any():  # the axis is logarithmic
+                    style = "line" if rows.sum() > 1 and not note else "points"
+                    x, y = at[rows], values[rows]
+                    curves.append(curve(x, y, ROLES[key], name, 2.0, style=style, note=note))
+        if curves:
+            curves.sort(key=lambda one: one["meta"]["role"] != "other")  # noise is drawn behind
+            unit = shown(unit)
+            label, across = f"{channel} [{unit}]" if unit else channel, "predicted ahead [s]"
+            panels.append(panel(label, across, unit, curves, log=True, x_ticks=ticks))
+    return panels
+
+
+def credit_figure(diagnosis: Diagnosis) -> Figure | None:
+    """Return each cause's share of the gain; None if there is no cause."""
+    if not diagnosis.credit:
+        return None
+    shares = [(c.of, c.share, percent(c.share), "best") for c in diagnosis.credit[:MOST_BARS]]
+    return Figure("credit", "What each is worth", "", [bars("Share of the gain", shares)])

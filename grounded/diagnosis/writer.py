@@ -1,40 +1,50 @@
-"""A decision, written out as a `Diagnosis`: what each room of the diagnosis says of it."""
+"""A decision, written out as a `Diagnosis`: what each room says of it, findings, the next step."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.causes import meaning, value_called
+from grounded import places
+from grounded.accounts.finding import in_the_log
+from grounded.diagnosis.causes import (
+    effect_of,
+    furthest_apart,
+    meaning,
+    sign_only,
+    value_called,
+)
 from grounded.diagnosis.error_report import (
+    CALIBRATION,
     ChannelShare,
-    Credit,
     Gap,
-    Remainder,
     RulerRow,
     Where,
+    errors,
     excess,
     furthest,
-    objection,
+    lost_most,
     open_noise,
 )
 from grounded.diagnosis.hypotheses.leftover import correction
+from grounded.diagnosis.levels import SURE
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import (
     Changed,
     Diagnosis,
+    Estimate,
+    Made,
     NoiseLevels,
-    Ranked,
     Score,
     TrialGroup,
     Unconfirmed,
     Verdict,
 )
-from grounded.diagnosis.remarks import next_step, remarks
 from grounded.diagnosis.validation.agreement import by_trial
 from grounded.diagnosis.validation.claims import Claims
 from grounded.diagnosis.validation.decide import Decision, Doubtful
@@ -47,10 +57,11 @@ from grounded.diagnosis.validation.measured import (
 )
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import acting_order, wrapping_order
-from grounded.findings import Finding, found
-from grounded.places import position
+from grounded.findings import Finding, Quantity, Weight, found
+from grounded.model import Model
 from grounded.result import number
 from grounded.task import Task
+from grounded.trial import Trial
 
 MOST_EFFECTS = 12  # most effects blamed at once
 NAMED = 2  # most parameters in the words of a cause
@@ -58,7 +69,18 @@ MENTIONED = 2  # most effects that one group of trials shows
 
 
 class Writer:
-    """Turns a decision into a Diagnosis."""
+    """Turns a decision into a Diagnosis.
+
+    Args:
+        decision: what is claimed.
+        ruler: the held-out errors that it rests on.
+        sound: the data, and what was found while they were made sound.
+        adopted: adopted effects, whose values are parameters of the model.
+        most: as many effects were looked for.
+        tick: called with the stage.
+        task: the task, None for a model alone.
+        uncertain: evaluates hypotheses with those parameters free that the search held.
+    """
 
     def __init__(
         self,
@@ -73,148 +95,132 @@ class Writer:
     ) -> None:
         self.decision, self.ruler, self.known, self.task = decision, ruler, sound.limits, task
         self.adopted, self.most, self.tick = adopted, most, tick
-        self.preflight = sound.looked.findings
-        self.trials = [trial for trial in sound.looked.trials if trial.known_steps >= 2]
-        self.search, self.best = decision.search, decision.fit
-        self.predictor, self.data = self.search.predictor, self.search.data
-        self.shown = list(zip(ruler.shown, ruler.names, strict=True))
+        self.preflight, trials = sound.looked.findings, sound.looked.trials
+        self.trials = [trial for trial in trials if trial.known_steps >= 2]
+        self.best, self.data = decision.fit, decision.search.data
         self.measured = Measured(decision, ruler, self.trials, sound.first, sound.exact)
         credit = {one.of: one.share for one in self.measured.credits}
         self.claims = Claims(decision, credit, self.known, ruler, uncertain)
-        self.left = self.measured.left
 
     def diagnosis(self, apart: tuple[Changed, ...] | None = None) -> Diagnosis:
         """All of it; `apart` is what differs between two groups of trials, if there are two."""
-        data, predictor = self.data, self.predictor
         self.tick("gap")
-        gain = explained(predictor, Hypothesis(), self.best)
-        if self.left:
-            i = data.model.state_names.index(self.left[0].channel)
-            gain = gain.copy()
-            gain[..., i] += self.left[0].improvement
-        ranking = self.claims.ranking(self.measured)
-        groups = self.claims.groups()
-        same = self.claims.equivalent(groups)
-        measured = self.measured
-        remainder = measured.remainders()
-        rows, credit = measured.prediction_error(), measured.credits
+        data, best, ruler, measured = self.data, self.best, self.ruler, self.measured
+        states, left = data.model.state_names, self.decision.left
+        rows, remainder = measured.prediction_error(), measured.remainders()
+        ranking, groups = self.claims.ranking(measured), self.claims.groups()
         named = [row.effect for row in ranking if row.claimed]
-        located = bool(named or remainder)  # else the gap is noise: shares of it tell nothing
+
+        # where the gap is; without a cause or a leftover it is noise, and shares tell nothing
+        gain = explained(ruler.predictor, Hypothesis(), best)
+        if left:
+            gain = gain.copy()
+            gain[..., states.index(left[0].channel)] += left[0].improvement
+        located = bool(named or remainder)
         if remainder and not named:  # what is left elsewhere is no gap
-            off_too = [data.model.state_names.index(one.channel) for one in remainder]
+            off_too = [states.index(one.channel) for one in remainder]
             gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
-        channels = self.channels(gain if located else np.full_like(gain, np.nan), rows)
-        seen = unconfirmed(self.claims, self.decision.doubtful, groups)
-        values, agreement = by_trial(self.best, data, named) if named else ((), ())
-        moved, parameters = len(data.groups), self.claims.parameters()
-        identified = self.claims.identified
-        said = self.verdict(ranking, remainder, rows, credit)
-        found = Diagnosis(
-            verdict=said,
-            where=Where(
-                channels=channels,
-                times=tuple(by_time(gain.sum(axis=-1), data)) if located else (),
-                regions=tuple(by_region(gain.sum(axis=-1), predictor, self.best))
-                if located
-                else (),
-                whiteness=measured.whiteness,
-                tempering=self.search.tempering.factor,
-            ),
+        total, region = gain.sum(axis=-1), by_region if located else lambda *_: []
+        where = Where(
+            channels=self.channels(gain if located else np.full_like(gain, np.nan), rows),
+            times=tuple(by_time(total, data)) if located else (),
+            regions=tuple(region(total, ruler.predictor, best)),
+            whiteness=measured.whiteness,
+            tempering=self.decision.search.tempering.factor,
+        )
+        gap = Gap(
+            horizon_s=ruler.steps[-1] * data.dt,
+            unit="noise-normalised rms",
+            before=measured.gap(self.decision.crude),
+            after=measured.gap(best),
+            floor=1.0,
+            held_out=ruler.held_out,
+        )
+        values, agreement = by_trial(best, data, named) if named else ((), ())
+        identified, parameters = self.claims.identified, self.claims.parameters()
+        ids = [name or f"#{i + 1}" for i, name in enumerate(data.ids)]
+        written = Diagnosis(
+            verdict=Verdict("unknown"),
+            where=where,
             ranking=ranking,
-            acting=_in_action(self.best.hypothesis, said.effects),
             indistinguishable=groups,
-            equivalent=same,
-            gap=Gap(
-                horizon_s=self.ruler.steps[-1] * data.dt,
-                unit="noise-normalised rms",
-                before=measured.gap(self.decision.crude),
-                after=measured.gap(self.best),
-                floor=1.0,
-                held_out=self.ruler.held_out,
-            ),
+            equivalent=self.claims.equivalent(groups),
+            gap=gap,
             leftover=remainder,
-            unconfirmed=seen,
-            correction=correction(self.ruler, self.best, self.left),
+            unconfirmed=unconfirmed(self.claims, self.decision.doubtful, groups),
+            correction=correction(ruler, best, left),
             noise=self.noise(),
             parameters=parameters,
             identifiable=identified.parameters,
             combinations=identified.combinations,
             prediction_error=rows,
-            credit=credit,
+            credit=measured.credits,
             per_trial=values,
             agreement=agreement,
             changed=apart,
             trials=data.count,
-            motions=moved,
             groups=tuple(
-                TrialGroup(
-                    f"g{k}",
-                    tuple(data.ids[i] or f"#{i + 1}" for i in group.trials),
-                    group.differs_in,
-                )
+                TrialGroup(f"g{k}", tuple(ids[i] for i in group.trials), group.differs_in)
                 for k, group in enumerate(data.groups, 1)
             ),
-            held_out=self.ruler.by,
+            held_out=ruler.by,
             score=self.score(),
             steps=data.steps,
-            candidates=len(self.search.candidates),
+            candidates=len(self.decision.search.candidates),
             preflight=self.preflight,
+            made=Made(
+                nominal=dict(zip(data.model.params, data.model.values.tolist(), strict=True))
+            ),
             tracked=() if self.task is None else _tracked(self.task),
         )
-        return replace(found, findings=self.findings(found))
+        said = self.verdict(written)
+        acting = _in_action(best.hypothesis, said.effects)
+        written = replace(written, verdict=said, acting=acting)
+        return replace(written, findings=self.findings(written))
 
     def findings(self, d: Diagnosis) -> tuple[Finding, ...]:
         """What is told beside the diagnosis' lines, and the next step."""
-        known, rows = self.known.findings, d.prediction_error
-        off = d.leftover[0].channel if d.leftover else open_noise(rows)
-        ties = [group for group in d.indistinguishable if group not in d.equivalent]
-        doubt = objection(rows, d.agreement, d.effects, ties, d.leftover)
-        step = next_step(d, self.claims, doubt, off, self.trials, self.adopted)
         more = [found("gap.more", most=self.most)] * d.verdict.again
-        return (*known, *more, *remarks(d, self.data.model, self.adopted), step)
+        step = next_step(d, self.trials, self.adopted)
+        return (*self.known.findings, *more, *remarks(d, self.data.model, self.adopted), step)
 
-    def verdict(
-        self,
-        ranking: Sequence[Ranked],
-        remainder: Sequence[Remainder],
-        rows: Sequence[RulerRow],
-        credit: Sequence[Credit],
-    ) -> Verdict:
+    def verdict(self, d: Diagnosis) -> Verdict:
         """The kind of the verdict, and the causes in words."""
-        claims, row = self.claims, furthest(rows)
-        if claims.known.no_cause:
-            return Verdict("unknown", limit=claims.known.findings[0].code)
-        claimed = tuple(row.effect for row in ranking if row.claimed)
+        row = furthest(d.prediction_error)
+        if self.known.no_cause:
+            return Verdict("unknown", limit=self.known.findings[0].code)
+        claimed = tuple(row.effect for row in d.ranking if row.claimed)
         if not claimed:
             bound = row is not None and row.floor_at_most
-            unsure = bound and not excess(rows) and not self.adopted
-            return Verdict("unknown" if remainder or unsure else "none")
-        off = tuple(self.data.model.param_names[one.index] for one in claims.moved)
+            unsure = bound and not excess(d.prediction_error) and not self.adopted
+            return Verdict("unknown" if d.leftover or unsure else "none")
+        off = tuple(self.data.model.param_names[i] for i in self.claims.moved)
         return Verdict(
             "effect" if len(claimed) == 1 else "several",
             effects=claimed,
-            causes=self.causes(ranking, credit, off),
+            causes=self.causes(d, off),
             parameters=off,
-            again=len(claims.names) == self.most and any(one.above for one in remainder),
+            again=len(self.claims.names) == self.most and any(one.above for one in d.leftover),
         )
 
-    def causes(
-        self, ranking: Sequence[Ranked], credit: Sequence[Credit], off: Sequence[str]
-    ) -> tuple[str, ...]:
-        """The words of each cause, the largest first."""
-        params, known = self.data.model.params, self.claims.parameters()
-        values = {row.effect: row.params for row in ranking}
+    def causes(self, d: Diagnosis, off: Sequence[str]) -> tuple[str, ...]:
+        """The words of each cause, the largest first; of parameters, all that are adopted count."""
         effects = {effect.name: effect for effect in self.best.hypothesis.effects}
         called = [value_called(name, self.adopted) for name in off]
-        each = (
-            f"{c} = {known[n].text}, was {number(params[n].value)}"
+        each = [
+            f"{c} = {d.parameters[n].text}, was {number(d.made.nominal[n])}"
             for c, n in zip(called, off, strict=True)
-        )
-        more = [f"{len(off) - NAMED} more"] * (len(off) > NAMED)
-        shown = tuple(each) if len(off) <= NAMED else None
-        own = found("model.off", values=shown, names=(*called[:NAMED], *more)).sentence
+        ]
+        shown = each if len(off) <= NAMED else called[:NAMED]
+        rest = len({*off, *d.adoptable}) - len(shown)
+        words = (*shown, *[f"{rest} more"] * (rest > 0))
+        values = words if len(off) <= NAMED else None
+        own = found("model.off", values=values, names=words).sentence
         return tuple(
-            meaning(effects[one.of], values[one.of]) if one.of in effects else own for one in credit
+            meaning(effects[one.of], row.params)
+            if one.of in effects and (row := d.ranked(one.of))
+            else own
+            for one in d.credit
         )
 
     def score(self) -> Score:
@@ -237,7 +243,7 @@ class Writer:
                 unit=self.data.model.states[name],
                 noise=ahead.noise_floor[name],
             )
-            for i, name in self.shown
+            for i, name in zip(self.ruler.shown, self.ruler.names, strict=True)
         ]
         return tuple(sorted(found, key=lambda one: -np.nan_to_num(one.share)))
 
@@ -246,9 +252,10 @@ class Writer:
         noise = self.best.noise
         tau = noise.structure.tau
         q, r = np.exp(0.5 * noise.log_q), np.exp(0.5 * noise.log_r)
+        shown = [*zip(self.ruler.shown, self.ruler.names, strict=True)]
         return NoiseLevels(
-            process={name: float(q[i]) for i, name in self.shown},
-            measurement={name: float(r[i]) for i, name in self.shown},
+            process={name: float(q[i]) for i, name in shown},
+            measurement={name: float(r[i]) for i, name in shown},
             correlation_s=np.nan if tau is None else tau,
             outliers=not isinstance(noise.weight_v, float),
         )
@@ -259,7 +266,7 @@ def _tracked(task: Task) -> tuple[str, ...]:
     weighed = task.reward.state + task.reward.terminal
     followed = (weighed != 0) & np.isfinite(task.target).any(axis=0)
     names = [n for n, own in zip(task.model.state_names, followed, strict=True) if own]
-    first = position(task.model)
+    first = places.position(task.model)
     rates = {n for n in names if task.model.states[n].endswith("/s")}
     return tuple(sorted(names, key=lambda n: (n not in first, n in rates)))
 
@@ -296,3 +303,181 @@ def unconfirmed(
         if one.name not in tied and not claims.known.no_cause
     ]
     return tuple(found[:MENTIONED])
+
+
+def quantity(e: Estimate) -> Quantity:
+    """Return an estimate as a fact."""
+    return Quantity(e.value, e.unit, e.std)
+
+
+def remarks(d: Diagnosis, model: Model, adopted: Collection[str] = ()) -> Iterator[Finding]:
+    """Yield what a person should know beside the verdict, the errors and the gap.
+
+    Args:
+        d: the diagnosis.
+        model: the model that was diagnosed.
+        adopted: adopted effects, whose values are parameters of the model.
+    """
+    if d.no_cause:
+        return
+    yield from _of_groups(d, adopted)
+    for group in d.indistinguishable:
+        first, *others = group
+        code = "gap.equivalent" if group in d.equivalent else "gap.tie"
+        own = not first.startswith("parameter:")  # a fit writes these
+        yield found(code, *group, effect=first, others=tuple(others), own=own)
+    for seen in d.unconfirmed:
+        yield found(
+            "gap.unconfirmed",
+            seen.effect,
+            nats=seen.evidence,
+            effect=seen.effect,
+            values=", ".join(f"{name} = {e.text}" for name, e in seen.params.items()),
+            seen=len(seen.trials),
+            trials=d.trials,
+        )
+    if d.effects or d.verdict.parameters:
+        yield from _of_errors(d)
+        yield from _of_values(d, adopted)
+        yield from _of_model(d, model)
+    if len(d.groups) == 1 < d.trials and (d.leftover or d.unconfirmed):
+        yield found("gap.one_motion")
+    if not d.leftover and (state := open_noise(d.prediction_error)):
+        yield found("gap.noise", state=state)
+    if (curve := d.correction) is not None and curve.adoptable:
+        state, gain = curve.channel, curve.held_out_gain
+        yield found("gap.correction", state, over=curve.over, gain=gain, state=state)
+    if odd := in_the_log(d.preflight):
+        yield found("gap.corrected", *(one.signal for one in odd))
+
+
+def _of_groups(d: Diagnosis, adopted: Collection[str]) -> Iterator[Finding]:
+    """What changed between two groups of trials, or where trials disagree."""
+    for one in d.changed or ():
+        own = one.effect.startswith("parameter:")
+        value = value_called(one.quantity, adopted) if own else f"{one.quantity} of {one.effect}"
+        first, second = quantity(one.first), quantity(one.second)
+        yield found(
+            "gap.changed", one.effect, nats=one.evidence, value=value, first=first, second=second
+        )
+    if d.changed is not None and not d.changed:
+        yield found("gap.changed", weight=Weight.NOTE)
+    for test in d.agreement if d.changed is None else ():
+        values = [v for v in d.per_trial if (v.effect, v.quantity) == (test.effect, test.quantity)]
+        if test.agrees or len(values) < 2:
+            continue
+        low, high = furthest_apart(values)
+        unit = test.estimate.unit
+        yield found(
+            "gap.disagree",
+            test.effect,
+            quantity=test.quantity,
+            effect=test.effect,
+            low=Quantity(low.value, unit, low.std),
+            high=Quantity(high.value, unit, high.std),
+            trial=low.trial,
+            trial2=high.trial,
+        )
+
+
+def _of_errors(d: Diagnosis) -> Iterator[Finding]:
+    """Errors that grow, and those that stay above the noise without a cause."""
+    rows = d.prediction_error
+    if lost := lost_most(rows):
+        row, name = lost
+        ends = errors(row, name, now="with_effects", before="crude")
+        yield found("gap.worse", name, state=name, **_when(row), **ends)
+    if (above := excess(rows)) and not d.leftover:
+        times, name, row = above
+        off = errors(row, name, error="with_effects")
+        share = row.with_effects[name] / max((row.outset or row.crude)[name], 1e-300)
+        yield found("gap.small", name, state=name, times=times, share=share, **_when(row), **off)
+
+
+def _when(row: RulerRow) -> dict[str, Any]:
+    """Return how far ahead the errors of a row are, as facts."""
+    return {"whole": True} if row.whole_trial else {"ahead": row.horizon_s}
+
+
+def _of_values(d: Diagnosis, adopted: Collection[str]) -> Iterator[Finding]:
+    """What values rest on, stopped at, and may be zero."""
+    rests: dict[tuple[str, ...], list[str]] = {}
+    for name, on in d.conditions.items():
+        rests.setdefault(on, []).append(value_called(name, adopted))
+    for on, names in rests.items():
+        yield found("model.given", *names, rests=on)
+    if d.jointly:
+        yield found("model.given", *(value_called(name, adopted) for name in sorted(d.jointly)))
+    if stopped := [name for name, e in d.parameters.items() if e.stopped]:
+        yield found("model.at_bound", *stopped)
+    if lost := [name for name in d.parameters if name not in d.known_parameters]:
+        yield found("model.not_told", *(value_called(name, adopted) for name in lost))
+    of = {name: effect_of(name, adopted) for name in d.parameters}
+    for effect in sorted({*of.values()} - {""}):
+        name, *more = (name for name, own in of.items() if own == effect)
+        e = d.parameters[name]
+        if not more and abs(e.value) < SURE * e.std:
+            yield found("model.unneeded", effect, effect=effect, value=quantity(e))
+    for row in (row for row in d.ranking if row.claimed and row.effect.startswith("input_gain:")):
+        if sign_only(row.effect, row.params):
+            yield found("gap.sign", row.effect, input=row.effect.partition(":")[2])
+
+
+def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
+    """What the model's structure lets a claimed effect stand for."""
+    names = {*d.effects}
+    if any(name.startswith("sensor_scale:") for name in names):
+        for state, rate in places.only_read(model).items():
+            if f"sensor_scale:{state}" in names:
+                yield found("model.sensor", state, rate=rate)
+    if any(name.startswith("sensor_bias:") for name in names):
+        level = [name for name in places.levelled(model) if f"sensor_bias:{name}" in names]
+        yield from [found("model.sensor", *level)] * bool(level)
+
+
+def next_step(d: Diagnosis, trials: Sequence[Trial], adopted: Collection[str] = ()) -> Finding:
+    """Return what to do next.
+
+    Args:
+        d: the diagnosis.
+        trials: those that were diagnosed.
+        adopted: adopted effects, whose values are parameters of the model.
+    """
+    if d.no_cause:
+        return found("gap.next.record")
+    if d.changed:
+        return found("gap.next.changed")
+    turned = [row.effect for row in d.ranking if row.claimed and sign_only(row.effect, row.params)]
+    if d.separable:
+        first, *others = d.separable[0]
+        return found("gap.next.apart", effect=first, others=tuple(others))
+    if d.unconfirmed:
+        effect = d.unconfirmed[0].effect
+        return found("gap.next.confirm", effect, effect=effect)
+    # the state whose error has no known cause, or may be noise
+    off = d.leftover[0].channel if d.leftover else open_noise(d.prediction_error)
+    if off and not any(one.of != CALIBRATION for one in d.credit):
+        return _look(d, off, trials)
+    if not d.effects:
+        return found("gap.next.none", adopted=bool(adopted))
+    if (doubt := d.doubt) is not None:
+        return doubt
+    if turned:
+        return found("gap.next.flip", input=turned[0].partition(":")[2])
+    return found("gap.next.adopt", left=bool(d.leftover))
+
+
+def _look(d: Diagnosis, off: str, trials: Sequence[Trial]) -> Finding:
+    """Return what to run to investigate a leftover: first a repeat, then a new motion."""
+    left = d.leftover[0] if d.leftover else None
+    if left is not None and left.part is not None:
+        part = left.part
+        return found("gap.next.look", trial=part.trial, start=part.start, end=part.end)
+    runs = Counter(trial.candidate or trial.inputs.tobytes() for trial in trials)
+    if max(runs.values(), default=0) > 1:
+        region = left.region if left is not None else None
+        place = None if region is None or region.of_time else region.told
+        inputs = None if place else trials[-1].input_names
+        return found("gap.next.elsewhere", state=off, place=place, inputs=inputs)
+    name = trials[-1].candidate or None
+    return found("gap.next.repeat", state=off, candidate=name, log=name is None)

@@ -5,6 +5,6 @@
     augmented   states that a filter carries beside the model's: coloured noise, delayed channels
 
 Nothing here knows a model or a trial: a linear system goes in, arrays come out. Who linearises,
-and about what, is the caller's: `grounded.estimate.smoother` (the extended Kalman filter),
+and about what, is the caller's: `grounded.estimate` (the extended Kalman filter),
 `grounded.diagnosis.likelihood.linearise` (a hypothesis along its own track).
 """

@@ -43,7 +43,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.noise import NoiseModel, Structure
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
-from grounded.diagnosis.parts import Diagnosis, Made
+from grounded.diagnosis.parts import Diagnosis
 from grounded.diagnosis.validation.identifiable import WEAK
 from grounded.effects import Effect, Library, Scales, scales_of
 from grounded.effects.actuator import delay_again
@@ -371,7 +371,7 @@ def probe(
         step = found("gap.next.probe", *names, by=expected, probe=words, **pair)
         return Probe(chosen, expected, step)
     claimed = next((name for name in names if name in diagnosis.effects), None)
-    claimed = claimed if most < SEPARABLE_NATS and not diagnosis.contested else None
+    claimed = claimed if most < SEPARABLE_NATS and not diagnosis.doubt else None
     step = found("gap.next.no_probe", *names, claimed=claimed, **pair)
     return Probe(chosen, expected, step, little=True)
 
@@ -419,7 +419,7 @@ def _effect(
     A quantity that the diagnosis did not estimate is held: whether parameters already describe the
     viscous part of a friction may depend on their values, which are calibrated here.
     """
-    effect, adopted = library.effect(name, task.model, scales), diagnosis.made or Made()
+    effect, adopted = library.effect(name, task.model, scales), diagnosis.made
     if row := diagnosis.ranked(name):
         kept = (
             q if q.fixed or q.name in row.params else replace(q, fixed=True)

@@ -8,10 +8,10 @@ import pytest
 
 from grounded import GroundedError, Trial
 from grounded.diagnosis.diagnose import diagnose
-from grounded.diagnosis.error_report import Credit, Remainder
+from grounded.diagnosis.error_report import Remainder
 from grounded.diagnosis.levels import NATS
-from grounded.diagnosis.parts import Ranked
-from grounded.diagnosis.validation.certainty import fewest
+from grounded.diagnosis.parts import Diagnosis, Ranked, Verdict
+from grounded.diagnosis.validation.claims import fewest
 from grounded.diagnosis.writer import Writer
 from grounded.models.pendulum import model as pendulum
 from grounded.search.design import probe
@@ -114,17 +114,11 @@ def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_
     claimed = [f"viscous_friction:{k}" for k in range(max(most, 3))]
     rows = tuple(Ranked(name, {}, {}, 50.0, claimed=True) for name in claimed)
     claims = SimpleNamespace(
-        known=SimpleNamespace(no_cause=False),
-        blamed=(),
         moved=(),
         names=claimed,
-        data=SimpleNamespace(model=pendulum),
-        best=SimpleNamespace(hypothesis=SimpleNamespace(effects=())),
-        parameters=dict,
     )
-    credit = (Credit("calibration", 1.0),)
     left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
     writer = SimpleNamespace(claims=claims, adopted=(), most=most, causes=lambda *args: ())
-    writer.data = claims.data
-    found = Writer.verdict(writer, rows, left, (), credit)
+    writer.known = SimpleNamespace(no_cause=False)
+    found = Writer.verdict(writer, Diagnosis(Verdict("several"), ranking=rows, leftover=left))
     assert found.again is more

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.parts import Diagnosis
+from grounded.diagnosis.parts import Diagnosis, Made
 from grounded.effects import Library
 from grounded.errors import GroundedError
 from grounded.result import Document
@@ -40,7 +40,7 @@ def test_a_real_diagnosis_is_read_back_as_it_was(kind, trials, changes):
 
 def test_an_older_document_is_read_with_what_it_has():
     found = Diagnosis.from_json(DIAGNOSIS)
-    assert found.made is None and found.probe == "" and not found.ranking[0].claimed
+    assert found.made == Made() and found.probe == "" and not found.ranking[0].claimed
     assert found.values("viscous_friction:v") == {"k": 0.3}
     assert again(found) == found
     oldest = Diagnosis.from_json({"verdict": {"kind": "none"}})

@@ -2,7 +2,7 @@
 
 from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.parts import Diagnosis, Verdict
-from grounded.diagnosis.pictures import accuracy_figure
+from grounded.diagnosis.telling import accuracy_figure
 
 
 def test_the_error_over_whole_trials_is_no_error_at_a_horizon():

@@ -10,10 +10,9 @@ from grounded.diagnosis.error_report import (
     excess,
     furthest,
     lost_most,
-    objection,
     telling,
 )
-from grounded.diagnosis.parts import Agreement
+from grounded.diagnosis.parts import Agreement, Diagnosis, Verdict
 
 
 def row(crude, after, floor=None, **more):
@@ -56,7 +55,7 @@ def test_a_slow_plant_is_told_by_whole_trials():
 ALIKE, UNLIKE = (Agreement("delay:u", "d", agrees=agrees) for agrees in (True, False))
 LITTLE, MUCH = (row({"x": 2.0, "v": 1.0}, {"x": x, "v": 1.0}) for x in (1.7, 0.5))
 PAIR = ("sensor_delay:psi", "coupling:p<-phi")
-LEFT, WIDE = ([Remainder("x", error=e, floor=1.0)] for e in (1.5, 3.5))
+LEFT, WIDE = ((Remainder("x", error=e, floor=1.0),) for e in (1.5, 3.5))
 
 
 @pytest.mark.parametrize(
@@ -76,4 +75,7 @@ LEFT, WIDE = ([Remainder("x", error=e, floor=1.0)] for e in (1.5, 3.5))
     ],
 )
 def test_a_claim_is_contested(given, contested):
-    assert bool(objection(*given)) is contested
+    names = ("prediction_error", "agreement", "effects", "indistinguishable", "leftover")
+    parts = dict(zip(names, given, strict=False))
+    verdict = Verdict("effect", parts.pop("effects"))
+    assert bool(Diagnosis(verdict, **parts).doubt) is contested

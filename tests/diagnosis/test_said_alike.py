@@ -13,11 +13,12 @@ from grounded.diagnosis.parts import (
     Diagnosis,
     Estimate,
     Ranked,
+    TrialGroup,
     TrialValue,
     Verdict,
 )
-from grounded.diagnosis.remarks import remarks
 from grounded.diagnosis.telling import effect_table, told
+from grounded.diagnosis.writer import remarks
 from grounded.effects import Library
 from grounded.model import Model, Param
 
@@ -69,7 +70,7 @@ def diagnosed(**more) -> Diagnosis:
         "credit": (Credit(FRICTION, 0.9),),
         "prediction_error": (ERRORS,),
         "trials": 3,
-        "motions": 2,
+        "groups": (TrialGroup("g1"), TrialGroup("g2")),
     }
     return Diagnosis(**parts | more)
 
@@ -133,5 +134,6 @@ def test_errors_that_grow_and_values_at_bounds_are_told():
     assert "sign" not in codes(diagnosed(ranking=(gain,)))
     turned = replace(gain, params={"g": Estimate(-2.0, 0.1)})
     assert "sign" in codes(diagnosed(ranking=(turned,)))
-    assert "one_motion" in codes(diagnosed(motions=1, leftover=(Remainder("v", 0.1),)))
+    once = diagnosed(groups=(TrialGroup("g1"),), leftover=(Remainder("v", 0.1),))
+    assert "one_motion" in codes(once)
     assert np.isnan(said["gap.worse"].nats)

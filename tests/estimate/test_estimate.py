@@ -1,16 +1,20 @@
 """Compares the filter with a dense Gaussian, noise and states with truth."""
 
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 import pytest
 
-from facts import holding
 from grounded.compile.problem import queue_of
-from grounded.errors import GroundedError
-from grounded.estimate import NoiseStd, batch_of, process_noise, record_of, smoothed
-from grounded.estimate.smoother import LAST_GAIN, filtered
+from grounded.estimate import (
+    LAST_GAIN,
+    NoiseStd,
+    Record,
+    batch_of,
+    filtered,
+    process_noise,
+    smoothed,
+)
 from grounded.model import Model, Param
 from grounded.models.car import model as car
 from grounded.trial import Trial
@@ -52,11 +56,14 @@ def simulated(model, rng, noise, *, B=4, T=100, latency=0.0, low=-1.0, high=1.0)
     return [x[:, b] for b in range(B)], [Trial(y[:, b], u[:, b], dt, *names) for b in range(B)]
 
 
-def estimated(model, trials, noise, **how):
-    return smoothed(model, [record_of(model, trial) for trial in trials], noise, **how)
+def record_of(trial):
+    times = np.arange(len(trial.states)) * trial.dt
+    past = np.zeros(trial.inputs.shape[1]) if trial.start_inputs is None else trial.start_inputs
+    return Record(times, trial.states, times[:-1], trial.inputs, past)
 
 
-filter_trials = partial(estimated, forward=True)
+def estimated(model, trials, noise):
+    return smoothed(model, [record_of(trial) for trial in trials], noise)
 
 
 def dense(model, trial, noise):
@@ -88,16 +95,13 @@ def test_a_linear_model_is_filtered_and_smoothed_exactly():
     found = estimated(SPRING, trials, SPRING_NOISE)[0]
     assert found.loglik == pytest.approx(loglik, abs=1e-6)
     assert np.allclose(found.states.ravel(), after, atol=1e-9)
-    forward = filter_trials(SPRING, trials, SPRING_NOISE)[0]
-    assert forward.loglik == pytest.approx(loglik, abs=1e-6)
-    assert np.allclose(forward.states[-1], found.states[-1])
 
 
 def test_a_state_that_nothing_measures_is_smoothed_halfway_up_its_disturbances():
     """Exactly: (x_t + f(x_t-1)) / 2 of the dense Gaussian."""
     _, trials = simulated(SPRING, np.random.default_rng(0), SPRING_NOISE, B=1, T=30)
     trial, n, noise = trials[0], 2, SPRING_NOISE
-    record = record_of(SPRING, trial)
+    record = record_of(trial)
     seen = np.where([True, False], trial.states, np.nan)
     record = replace(record, measured=seen, start_std=SPRING_NOISE.measurement)
     start = np.array([trial.states[0, 0], 0.0])
@@ -128,9 +132,7 @@ def test_no_other_noise_is_likelier():
     lost = trials[1].states.copy()
     lost[5:8, 0], lost[3] = np.nan, np.nan
     gappy = Trial(lost, trials[1].inputs, DT, SPRING.state_names, SPRING.input_names)
-    records = [
-        record_of(SPRING, one) for one in (trials[0], gappy, cut_short(SPRING, trials[2], 10))
-    ]
+    records = [record_of(one) for one in (trials[0], gappy, cut_short(SPRING, trials[2], 10))]
     found = process_noise(SPRING, records, SPRING_NOISE.measurement)
     best = filtered(SPRING, batch_of(records), found).loglik
     for other in found.process * np.exp([[0.2, 0], [-0.2, 0], [0, 0.2], [0, -0.2], [0.1, -0.1]]):
@@ -158,7 +160,7 @@ def whiteness(found):
 def test_the_noise_is_recovered_and_the_filter_is_consistent():
     rng = np.random.default_rng(4)
     truth, trials = simulated(car, rng, CAR_NOISE, B=8, T=150, latency=0.1, low=0.2, high=0.9)
-    records, latency = [record_of(car, trial) for trial in trials], np.array([0.1, 0.1])
+    records, latency = [record_of(trial) for trial in trials], np.array([0.1, 0.1])
     found = process_noise(car, records, CAR_NOISE.measurement, latency=latency)
     assert np.allclose(np.log(found.process / CAR_NOISE.process), 0, atol=0.35)
     square, lagged = whiteness(smoothed(car, records, found, latency=latency))
@@ -174,7 +176,7 @@ def test_the_noise_is_recovered_and_the_filter_is_consistent():
 def test_a_filter_with_the_wrong_noise_has_large_innovations():
     _, trials = simulated(SPRING, np.random.default_rng(12), SPRING_NOISE)
     wrong = NoiseStd(SPRING_NOISE.process / 3, SPRING_NOISE.measurement, DT)
-    squares = [whiteness(filter_trials(SPRING, trials, n))[0] for n in (SPRING_NOISE, wrong)]
+    squares = [whiteness(estimated(SPRING, trials, n))[0] for n in (SPRING_NOISE, wrong)]
     assert squares[0] == pytest.approx(1.0, abs=0.1) and squares[1] > 1.2
 
 
@@ -187,7 +189,7 @@ def test_received_inputs_are_the_delay_queue_of_the_kernels(delay):
     sent = np.concatenate([np.full(depth, past[0]), u[:, 0]])
     queue = np.stack([sent[depth - 1 - i : depth - 1 - i + 20] for i in range(depth)], axis=1)
     expected = queue_of(0, np.array([delay]), (depth,)).effective(queue[: len(u)], u)
-    record = record_of(SPRING, trial)
+    record = record_of(trial)
     assert np.allclose(record.received(np.array([delay * DT])), expected)
 
 
@@ -197,7 +199,7 @@ def test_angles_wrap_in_innovations():
     assert np.abs(wrapped[:, 4]).max() > 4
     wrapped[:, 4] = (wrapped[:, 4] + np.pi) % (2 * np.pi) - np.pi
     again = Trial(wrapped, trials[0].inputs, DT, car.state_names, car.input_names)
-    a, b = (filter_trials(car, [t], CAR_NOISE)[0].loglik for t in (trials[0], again))
+    a, b = (estimated(car, [t], CAR_NOISE)[0].loglik for t in (trials[0], again))
     assert a == pytest.approx(b)
 
 
@@ -207,11 +209,3 @@ def test_a_model_that_runs_away_is_a_status():
     found = estimated(explosive, trials, SPRING_NOISE)[0]
     assert found.loglik == -np.inf
     assert "finite" in found.status
-
-
-def test_misuse_says_what_to_do():
-    _, trials = simulated(SPRING, np.random.default_rng(11), SPRING_NOISE, B=1)
-    with pytest.raises(GroundedError, match=holding("'steering'")):
-        record_of(car, trials[0])
-    with pytest.raises(GroundedError, match="finite"):
-        NoiseStd(np.array([np.nan]), np.ones(1), DT)

@@ -25,7 +25,7 @@ def turned(gain=0.4, tau=0.06, encoder=3e-4):
         x[k + 1] = real.system.step(x[k : k + 1], u[k // 4][None, None], real.values, 0.01)[0]
     y = x[:, :1] + encoder * np.random.default_rng(0).standard_normal((301, 1))
     y = np.hstack([y, np.full_like(y, np.nan)])
-    return Record(t, y, at, u[:, None], start_std=np.array([1.0, 5.0])), *x.T
+    return Record(t, y, at, u[:, None], np.zeros(1), start_std=np.array([1.0, 5.0])), *x.T
 
 
 @pytest.mark.parametrize(("tau", "rms"), [(0.15, 0.006), (0.054, 0.0085), (0.03, 0.012)])

@@ -17,18 +17,14 @@ from grounded.diagnosis.hypotheses.lookalike import (
     related,
     twins,
 )
-from grounded.diagnosis.hypotheses.search import LARGE_GAIN
-from grounded.diagnosis.levels import NATS, SURE
-from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.hypotheses.search import LARGE_GAIN, HypothesisSearch
+from grounded.diagnosis.levels import NATS, SHARE, SURE
+from grounded.diagnosis.likelihood.data import Data
+from grounded.diagnosis.likelihood.fitted import Fitted, calibrated, moved
 from grounded.diagnosis.likelihood.intervals import NORMAL
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import Estimate, Ranked
-from grounded.diagnosis.validation.certainty import (
-    Blame,
-    averaged,
-    moved_parameters,
-)
-from grounded.diagnosis.validation.decide import Decision
+from grounded.diagnosis.validation.decide import Decision, averaged
 from grounded.diagnosis.validation.identifiable import Identified, identified, values_of
 from grounded.diagnosis.validation.limits import Limits, excitation
 from grounded.diagnosis.validation.measured import Measured
@@ -74,25 +70,23 @@ class Claims:
         self.null = best if calibrating else search.best_null()
         self.base = search.score(decision.crude if parametric(best) else self.null)
         self.moved = self._known(moved_parameters(search, best, ruler))  # also beside effects
-        self.blamed = self.moved if calibrating else ()
+        self.blamed = self.moved if calibrating else {}
         self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
         clock = one_clock(self.data.model, late, ruler.names, excitation(self.data).still)
         self.same = [] if known.no_cause else [(one.effect, one.like) for one in clock]
 
-    def _known(self, off: Sequence[Blame]) -> tuple[Blame, ...]:
+    def _known(self, off: dict[int, float]) -> dict[int, float]:
         """Return the parameters that are off by as much as trials agree on, if one clearly is.
 
         Evidence takes the model for right: trials may disagree by more than it says.
         """
         known, model = self.parameters() if off else {}, self.data.model
-        sizes = dict[int, float]()
-        for one in off:
-            e = known[model.param_names[one.index]]
-            sizes[one.index] = abs(e.value - float(model.values[one.index])) / max(e.std, 1e-300)
+        values = {i: (known[model.param_names[i]], float(model.values[i])) for i in off}
+        sizes = {i: abs(e.value - was) / max(e.std, 1e-300) for i, (e, was) in values.items()}
         if max(sizes.values(), default=0.0) < SURE:
-            return tuple(off)
-        return tuple(one for one in off if sizes[one.index] > SURE)
+            return off
+        return {i: nats for i, nats in off.items() if sizes[i] > SURE}
 
     def ranking(self, measured: Measured) -> tuple[Ranked, ...]:
         """Return the claimed effects by credit, then rivals and rejected effects by evidence."""
@@ -128,11 +122,10 @@ class Claims:
     def off(self) -> list[tuple[str, float, Params]]:
         """Return the model's own parameters that are off: name, evidence (NaN: too inexact), by."""
         model, known, found = self.data.model, self.parameters(), []
-        for blame in self.blamed:
-            name = model.param_names[blame.index]
-            by = known[name].moved(-float(model.values[blame.index]))
-            nats = blame.nats if blame.nats > NATS else math.nan
-            found.append((f"parameter:{name}", nats, {"d": by}))
+        for i, nats in self.blamed.items():
+            name = model.param_names[i]
+            by = known[name].moved(-float(model.values[i]))
+            found.append((f"parameter:{name}", nats if nats > NATS else math.nan, {"d": by}))
         return found
 
     def estimates(self, fit: Fitted) -> list[dict[str, Estimate]]:
@@ -184,8 +177,9 @@ class Claims:
         that are equivalent with other values of these. For parameters that are off, they are
         effects that are equivalent or as likely alone.
         """
-        names, found = self.data.model.param_names, list[tuple[str, ...]]()
-        for own in (f"parameter:{names[blame.index]}" for blame in self.blamed[:2]):
+        found = list[tuple[str, ...]]()
+        blamed = [f"parameter:{self.data.model.param_names[i]}" for i in self.blamed]
+        for own in blamed[:2]:
             near = (e.name for e in self.search.candidates if related(self._effect(own), e))
             found.append((own, *[name for name in near if self._twins(own, name)][:2]))
         said = {name for group in found for name in group}
@@ -194,9 +188,9 @@ class Claims:
             for (_, spread, some), f in self.search.fits.items()
             if len(some) == 1 and spread == 0 and some[0] not in said and not parametric(f)
         ]
-        for blame in self.blamed[:1]:
+        for own in blamed[:1]:
             same = dict.fromkeys(f.hypothesis.names[0] for f in exact if self._as_likely(f))
-            found.append((f"parameter:{names[blame.index]}", *list(same)[:2]))
+            found.append((own, *list(same)[:2]))
         found += [(name, *(other for other, _ in self.rivals(name))) for name in self.names]
         found += [pair for pair in self.same if not any({*pair} <= {*group} for group in found)]
         return tuple(group for group in found if len(group) > 1)
@@ -307,3 +301,82 @@ def _estimate(value: float, std: float, half: float, unit: str) -> Estimate:
     """Return an estimate with its interval; its standard deviation is infinite if unknown."""
     found = Estimate(value, std, (value - half, value + half), unit)
     return found if found.known else Estimate(value, math.inf, None, unit)
+
+
+def loss(H: Array, b: Array, free: list[int]) -> float:
+    """Return the loss of log posterior if only `free` shifts may differ from zero [nats].
+
+    It is b' (H_rr - H_rS H_SS^-1 H_Sr) b / 2, with S the free ones, r the others, b their shifts.
+    """
+    rest = [i for i in range(len(b)) if i not in free]
+    if not rest:
+        return 0.0
+    block, left = H[np.ix_(rest, rest)], b[rest]
+    if free:
+        across = H[np.ix_(rest, free)]
+        block = block - across @ np.linalg.pinv(H[np.ix_(free, free)], hermitian=True) @ across.T
+    return 0.5 * float(left @ block @ left)
+
+
+def moved_parameters(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> dict[int, float]:
+    """Return the parameters of a calibrated fit that must differ from nominal, by importance.
+
+    These are indices in the model, each with the loss at its nominal value [nats]. The log
+    posterior of the shifts is approximated by a parabola at the fit, with curvature H (`loss`).
+    Evidence selects as few as possible, so that the others gain less than NATS. Of these, one
+    after another is left out, the least needed first, if predictions with it at nominal, the others
+    fitted again, are as good. So of two that can do each other's work (a gain and a time constant
+    of which the data only determine a combination), one stays.
+    """
+    data, h = search.data, fit.hypothesis
+    if h.spread == 0 or h.shift is None:
+        return {}
+    k, which = len(h.theta), calibrated(data)
+    G = fit.gram.sum(axis=0)
+    across = G[k:, :k]
+    H = G[k:, k:] - across @ np.linalg.pinv(G[:k, :k], hermitian=True) @ across.T
+    H = H + np.diag(fit.prior[k:])
+    b = h.shift[which] / data.model.spreads[which]
+    free, now = fewest(H, b, range(len(b)))
+    nats = {i: loss(H, b, [j for j in free if j != i]) - now for i in free}
+    if ruler.held_out:
+        least = SHARE * ruler.since_outset(fit)
+        rest = fit
+        gains = {i: ruler.gain(unmoved(data, fit, k + i), fit).mean for i in free}
+        for i in sorted(free, key=lambda i: gains[i])[:-1]:
+            less = unmoved(data, rest, k + i)  # beside those left out already, which may hide it
+            if gains[i] < least and ruler.gain(less, fit).mean < least:
+                free, rest = [j for j in free if j != i], less
+    # the parabola can't gain more than the fit itself
+    whole = max(search.score(fit) - search.score(search.exact_null()), 0.0)
+    by = sorted(free, key=lambda i: -nats[i])
+    return {int(which[i]): min(search.tempering.factor * nats[i], whole) for i in by}
+
+
+def fewest(H: Array, b: Array, allowed: Sequence[int]) -> tuple[list[int], float]:
+    """Select as few of the allowed shifts as possible; return them and what the others lose.
+
+    They are added one by one, each time the one that lowers the loss most, until it is below NATS.
+    """
+    free: list[int] = []
+    now = loss(H, b, free)
+    while len(free) < len(allowed) and (now > NATS or not free):
+        losses = {i: loss(H, b, [*free, i]) for i in allowed if i not in free}
+        i = min(losses, key=lambda j: losses[j])
+        free, now = [*free, i], losses[i]
+    return free, now
+
+
+def unmoved(data: Data, fit: Fitted, column: int) -> Fitted:
+    """Return the fit with one parameter at nominal, the others fitted again by a Newton step."""
+    h, index = fit.hypothesis, calibrated(data)[column - len(fit.hypothesis.theta)]
+    assert h.shift is not None
+    shift = h.shift[index] / data.model.spreads[index]
+    H = fit.gram.sum(axis=0) + np.diag(fit.prior)
+    rest = np.delete(np.arange(len(H)), column)
+    delta = np.zeros(len(H))
+    delta[column] = -shift
+    delta[rest] = shift * np.linalg.pinv(H[np.ix_(rest, rest)], hermitian=True) @ H[rest, column]
+    gram, score = fit.gram.copy(), fit.score - fit.gram @ delta
+    gram[:, column], gram[..., column], score[:, column] = 0.0, 0.0, 0.0  # it is fixed there
+    return replace(fit, hypothesis=moved(data, fit.hypothesis, delta), gram=gram, score=score)

@@ -18,6 +18,7 @@ A guard refuses a cause whatever it gains:
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -27,11 +28,11 @@ from grounded.diagnosis.hypotheses.explored import no_limits, sizeless
 from grounded.diagnosis.hypotheses.leftover import Leftover, corrections, leftovers
 from grounded.diagnosis.hypotheses.lookalike import Likeness, lookalikes
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
-from grounded.diagnosis.levels import NATS, SURE
+from grounded.diagnosis.levels import NATS, PICKED, SURE
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out
-from grounded.diagnosis.likelihood.intervals import fisher
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.intervals import NORMAL, fisher
 from grounded.diagnosis.likelihood.noise import Structure
-from grounded.diagnosis.validation.certainty import averaged
 from grounded.diagnosis.validation.choose import Choice, Errors, Option, Rule
 from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
@@ -39,6 +40,7 @@ from grounded.frozen import Array
 
 MEASURED = 6  # likeliest sets of each size, with and without free parameters, that are measured
 REFIT = 12  # iterations after a cause was removed
+LIKELIER_AT_MOST = 50.0  # most nats by which another fit counts as likelier
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,6 +309,50 @@ def _doubtful(options: Options, rule: Rule, choice: Choice) -> tuple[Doubtful, .
             if sized and (alone := one_group(search, fit, name)):
                 found.append(Doubtful(name, nats, fit, alone))
     return tuple(sorted(found, key=lambda one: -one.nats))
+
+
+def averaged(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> tuple[Array, Array]:
+    """Return averaged standard deviations and half-widths of 95 % intervals, (C,) each.
+
+    A claim's own interval assumes its noise structure, and exact parameters if they were not
+    calibrated. Yet evidence may hardly separate the fits, or calibration was dropped because
+    predictions don't need it. So the variance is averaged, by evidence, over all fits of the same
+    effects (Hoeting, Madigan, Raftery & Volinsky, Bayesian model averaging, 1999),
+
+        var = sum_f p_f (var_f + (value_f - value)^2)
+
+    about the claim's own value. Fits that predict held-out trials clearly worse are left out.
+    """
+    std, half = (np.array(a) for a in search.sure(fit))
+    own, size = _values(fit.hypothesis), len(fit.hypothesis.theta)
+    var, wide, whole = std[:size] ** 2, half[:size] ** 2, 1.0
+    for other, weight in _rivals(search, fit, ruler):
+        theirs = _values(other.hypothesis)
+        rows = [theirs[key] for key in own]
+        apart = other.hypothesis.theta[rows] - fit.hypothesis.theta
+        s, h = (a[rows] for a in search.sure(other))
+        var, wide = var + weight * (s**2 + apart**2), wide + weight * (h**2 + (NORMAL * apart) ** 2)
+        whole += weight
+    std[:size] = np.maximum(std[:size], np.sqrt(var / whole))
+    half[:size] = np.maximum(half[:size], np.sqrt(wide / whole))
+    return std, half
+
+
+def _rivals(search: HypothesisSearch, fit: Fitted, ruler: Ruler) -> list[tuple[Fitted, float]]:
+    """Return other fits of the same free values, and the weight of each relative to the claim."""
+    names, own, found = sorted(fit.hypothesis.names), _values(fit.hypothesis), []
+    for (_, _, some), other in search.fits.items():
+        nats = search.score(other) - search.score(fit)
+        likely = other is not fit and list(some) == names and nats > -PICKED
+        if likely and set(_values(other.hypothesis)) == set(own):
+            worse = ruler.held_out and ruler.gain(other, fit).clear
+            found += [] if worse else [(other, math.exp(min(nats, LIKELIER_AT_MOST)))]
+    return found
+
+
+def _values(h: Hypothesis) -> dict[tuple[str, str], int]:
+    """Return {(effect, quantity): index} of the free values."""
+    return {key: i for i, key in enumerate((e.name, q.name) for e in h.effects for q in e.free)}
 
 
 def plain(search: HypothesisSearch, fit: Fitted) -> Fitted:

@@ -29,7 +29,7 @@ from grounded.diagnosis.likelihood.carried import stepper
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delays_of
 from grounded.diagnosis.likelihood.fitted import Fitted, leave_one_out, moved
-from grounded.diagnosis.likelihood.hypothesis import Hypothesis, by_row
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.marching import marched
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.simulated import simulated
@@ -175,20 +175,35 @@ class Ruler:
         lengths = self.data.lengths[self.data.trial_of[self.wholes]]
         for steps in np.unique(lengths) if whole else ():
             run = self.wholes[lengths == steps]
-            error = missed(
-                self.predictor, each, of_run[run], track, np.zeros(len(run), int), run, int(steps)
-            )
+            error = self._missed(each, of_run, track, np.zeros(len(run), int), run, int(steps))
             square = error[1:] ** 2
             found.total[-1, self.piece0[run]] += np.nan_to_num(square).sum(axis=0)
             found.count[-1, self.piece0[run]] += np.isfinite(square).sum(axis=0)
         at, run = self.starts
         piece = self.piece0[run] + (at - 1) // self.steps[-1]
         most = max(self.steps[-1], int(first.max()))
-        error = missed(self.predictor, each, of_run[run], track, at, run, most, added)
+        error = self._missed(each, of_run, track, at, run, most, added)
         for k, steps in enumerate(self.steps):
             square = at_steps(error, steps, first) ** 2
             np.add.at(found.total[k], piece, np.nan_to_num(square))
             np.add.at(found.count[k], piece, np.isfinite(square))
+
+    def _missed(
+        self,
+        each: Sequence[Hypothesis],
+        of_run: Any,
+        track: Array,
+        at: Any,
+        run: Any,
+        steps: int,
+        added: Array | None = None,
+    ) -> Array:
+        """Return what is `missed` if each run is predicted by its own hypothesis."""
+        error = np.empty((steps + 1, len(at), self.data.model.n))
+        for i in np.unique(of_run[run]):
+            own = of_run[run] == i
+            error[:, own] = missed(self.predictor, each[i], track, at[own], run[own], steps, added)
+        return error
 
     def doubt(self, fit: Fitted) -> Array:
         """Return the jackknife standard error of each log rms error, over runs, (K, n')."""
@@ -286,7 +301,7 @@ class Ruler:
                 moments = np.zeros(1, int) if whole else several
                 at, run = np.tile(moments, len(runs)), np.repeat(runs, len(moments))
                 most = steps if whole else max(steps, int(first.max()))
-                error = missed(self.predictor, [h], 0 * at, fit.states, at, run, most)
+                error = missed(self.predictor, h, fit.states, at, run, most)
                 error = error[1:] if whole else at_steps(error, steps, first)[None]
                 error = error.reshape(len(error), len(runs), len(moments), -1)
                 there = np.isfinite(error).all(axis=1)
@@ -370,8 +385,7 @@ def by_fold(data: Data, fit: Fitted) -> tuple[list[Hypothesis], Any]:
 
 def missed(
     predictor: Predictor,
-    hypotheses: Sequence[Hypothesis],
-    which: Any,
+    h: Hypothesis,
     track: Array,
     at: Any,
     run: Any,
@@ -382,8 +396,7 @@ def missed(
 
     Args:
         predictor: evaluates hypotheses on the data.
-        hypotheses: hypotheses with the same effects.
-        which: index of the hypothesis that predicts from each moment, (M,) of int.
+        h: the hypothesis that predicts.
         track: states from which predictions start, (L + 1, B, n).
         at: step within the run of each moment, (M,) of int.
         run: run of each moment, (M,) of int.
@@ -393,31 +406,24 @@ def missed(
     Returns:
         Errors (steps + 1, M, n), NaN where not measured.
     """
-    data = predictor.data
+    data, n = predictor.data, predictor.data.model.n
     trial = data.trial_of[run]
     state0, step0 = (np.cumsum([0, *(data.lengths + more)])[trial] for more in (1, 0))
     step, last = data.step_at[run, 0] - step0 + at, data.lengths[trial]
     t = np.minimum(step + np.arange(steps)[:, None], last - 1)
-    each = [(h, np.flatnonzero(which == i)) for i, h in enumerate(hypotheses)]
-    each = [(h, own) for h, own in each if len(own)]
-    sent, begin = np.empty((*t.shape, 0)), dict[int, int]()
-    for h, own in each:
-        by_trial = predictor.received(h, leads=steps < LED)
-        if not sent.shape[-1]:
-            sent = np.empty((*t.shape, by_trial.shape[-1]))
-        sent[:, own] = by_trial[trial[own], t[:, own]]
-        delays = delays_of(h, data)  # sensors may show states from before the start
-        begin[id(h)] = 0 if delays is None else delays.oldest
-    oldest = max(begin.values())
+    sent = predictor.received(h, leads=steps < LED)[trial, t]
+    delays = delays_of(h, data)  # sensors may show states from before the start
+    oldest = 0 if delays is None else delays.oldest
     path = [track[np.maximum(at - j, 0), run] for j in range(oldest, -1, -1)]
-    together = by_row([h for h, _ in each], np.searchsorted(np.unique(which), which))
-    advance = stepper(predictor, together)
-    x, n = _widened(predictor, each, track, at, run), data.model.n
-    if (
-        added is None
-        and (marched := _marched(predictor, each, x, sent, t[0] * data.dt)) is not None
-    ):
-        path, sent = [*path, *marched[1:, :, :n]], sent[:0]  # all steps are done
+
+    # the states, with the memories of joints behind them
+    end = len(data.time) - 1
+    x = predictor.widened(h, track[: end + 1])[np.minimum(at, end), run]
+    x[:, :n] = track[at, run]
+    done = None if added is not None else _marched(predictor, h, x, sent, t[0] * data.dt)
+    if done is not None:
+        path, sent = [*path, *done[1:, :, :n]], sent[:0]  # all steps are done
+    advance = stepper(predictor, h)
     for j, (u, now) in enumerate(zip(sent, t[: len(sent)] * data.dt, strict=True)):
         x = advance(x, u, now)
         if added is not None:
@@ -426,28 +432,12 @@ def missed(
         x = np.fmax(np.fmin(x, DIVERGED), -DIVERGED)  # NaN becomes DIVERGED, too
         path.append(x[:, :n])
     states = np.stack(path)
-    logged = np.empty_like(states[oldest:])
-    for h, own in each:
-        since = states[oldest - begin[id(h)] :, own]
-        logged[:, own] = (since + predictor.offset(h, since))[begin[id(h)] :]
+    logged = (states + predictor.offset(h, states))[oldest:]
     ahead = step + np.arange(steps + 1)[:, None]
     flat = state0 + np.minimum(ahead, last)
     error = data.model.difference(data.filled[flat], logged)
     seen = np.isfinite(data.states[flat]) & (ahead <= last)[..., None]
     return np.where(seen, error, np.nan)
-
-
-def _widened(
-    predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], track: Array, at: Any, run: Any
-) -> Array:
-    """Return the states at each moment (M, n), and the memories of joints behind them."""
-    last, found = len(predictor.data.time) - 1, list[Array]()
-    for h, own in each:
-        whole = predictor.widened(h, track[: last + 1])[np.minimum(at, last), run]
-        found = found or [whole]
-        found[0][own] = whole[own]
-    found[0][:, : track.shape[-1]] = track[at, run]
-    return found[0]
 
 
 def unseen(predictor: Predictor, h: Hypothesis) -> Any:
@@ -468,21 +458,14 @@ def at_steps(error: Array, steps: int, first: Any) -> Array:
     return np.asarray(error[at, :, np.arange(len(at))].T)
 
 
-def _marched(
-    predictor: Predictor, each: Sequence[tuple[Hypothesis, Any]], x: Array, sent: Array, t: Array
-) -> Array | None:
+def _marched(predictor: Predictor, h: Hypothesis, x: Array, sent: Array, t: Array) -> Array | None:
     """Return compiled rollouts (steps + 1, M, n); None if not compiled, or one diverges.
 
     x (M, n), sent (steps, M, m or 2 m), t (M,): states, received inputs and times at the start.
     """
-    found = np.empty((len(sent) + 1, *x.shape))
-    for h, own in each:
-        z = predictor.marched(h, x[own], sent[:, own])
-        if z is not None and not (np.abs(z) < DIVERGED).all():
-            return None
-        if z is None:
-            z = marched(predictor, h, x[own], sent[:, own], t[own])
-        if z is None:
-            return None
-        found[:, own] = np.fmax(np.fmin(z, DIVERGED), -DIVERGED)
-    return found
+    z = predictor.marched(h, x, sent)
+    if z is None:
+        z = marched(predictor, h, x, sent, t)
+    elif not (np.abs(z) < DIVERGED).all():
+        return None
+    return None if z is None else np.fmax(np.fmin(z, DIVERGED), -DIVERGED)

@@ -12,7 +12,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.intervals import standard_deviations
-from grounded.diagnosis.validation.certainty import moved_parameters
+from grounded.diagnosis.validation.claims import moved_parameters
 from grounded.effects import Library
 
 
@@ -34,14 +34,14 @@ def test_of_two_parameters_that_hide_each_other_one_stays():
     search = HypothesisSearch(prepare(boat, trials), ())
     fit = search.nulls()
     without = SimpleNamespace(held_out=False)
-    assert {b.index for b in moved_parameters(search, fit, without)} == {0, 1, 2}
+    assert {*moved_parameters(search, fit, without)} == {0, 1, 2}
 
     def gain(less, whole):
         a, b, needed = np.abs(less.hypothesis.shift) > 1e-9
         return SimpleNamespace(mean=0.0 if needed and (a or b) else 1.0)
 
     ruler = SimpleNamespace(held_out=True, since_outset=lambda fit: 1.0, gain=gain)
-    left = {b.index for b in moved_parameters(search, fit, ruler)}
+    left = {*moved_parameters(search, fit, ruler)}
     assert 2 in left and len(left) == 2
 
 

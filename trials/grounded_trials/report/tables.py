@@ -10,8 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from grounded.diagnosis.pictures import accuracy_figure
-from grounded.diagnosis.telling import effect_table
+from grounded.diagnosis.telling import accuracy_figure, effect_table
 from grounded.diagnosis.telling import error_table as held_out_table
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure

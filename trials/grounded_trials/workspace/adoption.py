@@ -31,7 +31,6 @@ from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopted import in_order, installed_effects, planner_of, settled
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
-    made_from,
     newer_alone,
     read_diagnosis,
     since_diagnosis,
@@ -104,7 +103,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     without them make the robot oscillate. Nothing is adopted if [log] reads the trials in another
     way now, or if they were all set aside: then their log is ingested again.
     """
-    made, trials = made_from(diagnosis), workspace.whole_trials()
+    made, trials = diagnosis.made, workspace.whole_trials()
     here = {one.stored.id for one in trials}
     if made.trials and here.isdisjoint(made.trials):
         aside = [one for one in workspace.aside_trials() if one.stored.id in made.trials]
@@ -119,7 +118,7 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     new, undone = diagnosis.open(table.effects, table.params), {*_readable(workspace).undone}
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     alone = NextCommand("adopt", late) if late else None
-    claimed = diagnosis.kind in ("effect", "several") and not diagnosis.contested
+    claimed = diagnosis.kind in ("effect", "several") and not diagnosis.doubt
     if not claimed or {*new} <= undone:
         return alone
 
@@ -165,7 +164,7 @@ def joined(
     Raises:
         GroundedError: if a value is not known.
     """
-    before, fitted = made_from(diagnosis).effects, [*diagnosis.joining]
+    before, fitted = diagnosis.made.effects, [*diagnosis.joining]
     old, new = {str(effect["name"]): dict(effect) for effect in effects}, list[dict[str, Any]]()
     params = {name: _rounded(estimate.value) for name, estimate in calibrated.items()}
     last = len(fitted)
@@ -191,7 +190,7 @@ def _rounded(value: float) -> float:
 def _nominal(workspace: Folder, diagnosis: Diagnosis) -> dict[str, float]:
     """Return the values that parameters had when the diagnosis was made; else those of now."""
     own = {name: float(one.value) for name, one in workspace.base_model.params.items()}
-    return own | dict(made_from(diagnosis).nominal)
+    return own | dict(diagnosis.made.nominal)
 
 
 # adopting
@@ -221,7 +220,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     # The model with them.
     whole_fit = parameters and bool(physics) and claimed
     calibrated = diagnosis.adoptable if whole_fit else {}
-    file, model, known = workspace.config.file, workspace.config.model, made_from(diagnosis)
+    file, model, known = workspace.config.file, workspace.config.model, diagnosis.made
     nominal = _nominal(workspace, diagnosis)
     own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
     params = dict(model.params) | own
@@ -301,7 +300,7 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
     physics = [name for name in names if name not in diagnosis.late_sensors]
     if diagnosis.changed and physics:
         raise refused("gap.next.changed", then=newer_alone(diagnosis))
-    before, own = made_from(diagnosis).effects, [*diagnosis.effects, *_curves(diagnosis)]
+    before, own = diagnosis.made.effects, [*diagnosis.effects, *_curves(diagnosis)]
     known = {*(row.effect for row in diagnosis.ranking), *own, *diagnosis.late_sensors}
     adopted = {*_names(workspace.config.model.effects)} - {*before}.intersection(known)
     for name in names:

@@ -34,7 +34,6 @@ from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import (
     chosen,
     diagnosable,
-    made_from,
     model_print,
     write_diagnosis,
 )
@@ -159,7 +158,7 @@ def _with_next(
     """
     if wrong:
         found = found.asking(finding("gap.next.fix", *wrong), identity)
-    left = len(diagnosable(workspace)) - len(made_from(found).trials)
+    left = len(diagnosable(workspace)) - len(found.made.trials)
     if unasked := found.no_cause and left > 0 and whole:
         found = found.asking(finding("gap.next.record", stored=left))
     write_diagnosis(workspace.reports, found)  # again, now with the next step
@@ -222,7 +221,7 @@ def _probe(
         if made is None:
             break
         if made.little:
-            return "", None if found.contested else made.step
+            return "", None if found.doubt else made.step
         policy = planner.narrowed(made.policy)
         run = simulate(planner.plan.problem(exact=True), planner.widened(policy))
         candidate = probe_candidate(workspace, policy, run, best.candidate.id, run.utility)

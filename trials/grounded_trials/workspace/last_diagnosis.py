@@ -29,7 +29,7 @@ from grounded_trials.workspace.identity import named_trials, sha256
 from grounded_trials.workspace.readings import changed_since
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Diagnosis, Made
+    from grounded.diagnosis.parts import Diagnosis
     from grounded.trial import Trial
 
 FILE = "diagnosis.json"  # in reports/
@@ -49,11 +49,10 @@ def read_diagnosis(folder: Path) -> Diagnosis | None:
     """
     if not (folder / FILE).exists():
         return None
-    from grounded.diagnosis.parts import Diagnosis, Made  # slow, and seldom needed
+    from grounded.diagnosis.parts import Diagnosis  # slow, and seldom needed
 
     then = NextCommand("diagnose")
-    found = read_as(folder / FILE, Diagnosis, mend="diagnosis", then=then)
-    return found and replace(found, made=found.made or Made())  # an older version does not say
+    return read_as(folder / FILE, Diagnosis, mend="diagnosis", then=then)
 
 
 def readable_diagnosis(folder: Path) -> Diagnosis | None:
@@ -133,12 +132,6 @@ def left_out(workspace: Folder) -> list[Finding]:
 # what changed since a diagnosis
 
 
-def made_from(diagnosis: Diagnosis) -> Made:
-    """Return what a diagnosis in a workspace was made from."""
-    assert diagnosis.made is not None
-    return diagnosis.made
-
-
 @dataclass(frozen=True)
 class Since:
     """What changed since a diagnosis was made."""
@@ -197,7 +190,7 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     """Return what changed in a workspace since a diagnosis was made; nothing without one."""
     if diagnosis is None:
         return Since()
-    model, made, usable = workspace.config.model, made_from(diagnosis), usable_ids(workspace)
+    model, made, usable = workspace.config.model, diagnosis.made, usable_ids(workspace)
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others
@@ -221,6 +214,6 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
 
 def newer_alone(diagnosis: Diagnosis) -> NextCommand:
     """Return the diagnosis of the newer of the two groups that a diagnosis compared."""
-    made = made_from(diagnosis)
+    made = diagnosis.made
     newer = max(made.named, made.compared, key=lambda group: max(group, default=""))
     return NextCommand("diagnose", ("--trials", ",".join(newer)))

@@ -214,7 +214,7 @@ def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
             return here.adopt
         if found.probe:
             return to_run(workspace, found.probe, found.probe)
-        settled = found.kind in ("none", "unknown") or found.contested  # nothing to adopt
+        settled = found.kind in ("none", "unknown") or found.doubt  # nothing to adopt
         if not settled or not workspace.config.task.target:
             return REPORT
         return here.then

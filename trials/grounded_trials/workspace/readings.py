@@ -110,7 +110,7 @@ def changed_since(
     What the diagnosis corrected itself may have been written into [log] since. Once there is a
     trial that was read by the present [log], the others were left as they are on purpose.
     """
-    if diagnosis.made is None or not workspace.config.log.values:
+    if not workspace.config.log.values:
         return ()
     in_log = [one for one in diagnosis.preflight if one.log]
     corrected = {

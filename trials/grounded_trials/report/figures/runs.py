@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from grounded.diagnosis.pictures import gap_figures
+from grounded.diagnosis.telling import gap_figures
 from grounded.figures.figure import (
     STEPS,
     Dot,

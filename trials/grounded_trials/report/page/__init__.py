@@ -20,8 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.pictures import credit_figure
-from grounded.diagnosis.telling import FINDINGS, instrument_lines, sentence
+from grounded.diagnosis.telling import FINDINGS, credit_figure, instrument_lines, sentence
 from grounded.errors import needs
 from grounded.figures.figure import Panel, label_lines, typeset
 from grounded.figures.interactive import PALETTE, packed
@@ -146,5 +145,5 @@ def _why(findings: Findings) -> dict[str, Any]:
         "header": said.header,
         "preflight": instrument_lines(diagnosis.preflight),
         "notes": [sentence(one) for one in said.findings[FINDINGS:]],
-        "credit": credit_figure(diagnosis, 2),
+        "credit": credit_figure(diagnosis),
     }

@@ -23,7 +23,7 @@ import numpy as np
 
 from grounded.checks import refused
 from grounded.errors import GroundedError
-from grounded.estimate.record import Record, cut, part
+from grounded.estimate import NoiseStd, Record, cut, part, process_noise, smoothed
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -225,8 +225,6 @@ def _smoothed(
     records: list[Record], table: EstimateTable, task: Task, sizes: Array
 ) -> tuple[Array, Array]:
     """Smooth records; return the times, (N,) [s], and the states, (N, n)."""
-    from grounded.estimate import NoiseStd, process_noise, smoothed
-
     model, late = task.model, task.latency
     known = np.array([table.measured.get(name, 1.0) for name in model.state_names])
     guessed = [name not in table.measured for name in model.state_names]

@@ -1,4 +1,15 @@
-"""Estimate states, and the noise of the process, from records: the functions of this package.
+"""Estimate the states of records, and how much the model is disturbed: smoothed, process_noise.
+
+A `Record` holds measured states and commands of a run, each with its own times:
+
+    y_i = x(t_i) + v_i,          u_j(t) = command_j(t - latency_j)
+
+It may combine a camera at 30 Hz and a controller at 20 Hz: states are estimated at the instants
+`times`, and the input over [t_i, t_i+1] is the mean of the held commands over [t_i - latency,
+t_i+1 - latency]. On a common grid this equals the delay queue of `grounded.compile.problem`,
+including fractions of a step. A lost sample is NaN, and so is a state that nothing measures. A
+filter is fast if it runs over all trials at once, so records are combined to a `RecordBatch`, time
+first and padded to the longest: padding and lost samples are not `seen`, its steps not `valid`.
 
     x_{t+1} = f(x_t, u_t) + w_t,  w ~ N(0, diag(process^2)),     y = x + v,  v ~ N(0, diag(r^2))
     x^-_{t+1} = f(x_t, u_t),      A = f_x(x_t, u_t);             e_t = y_t - x^-_t
@@ -12,19 +23,19 @@ MacKay, "Bayesian interpolation", Neural Computation 4, 1992) while the likeliho
 without effect on the data (of a state that is never disturbed) would decrease for ever; it stops at
 a floor far below the visible scatter.
 
-Arrays have time first, (T + 1, B, ...): see `grounded.estimate.record`.
 Source: Särkkä, Bayesian Filtering and Smoothing (2013), ch. 5; Ljung, System Identification, ch. 7.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 
-from grounded.checks import refused, wrong
-from grounded.estimate.record import Record, RecordBatch, batch_of
+from grounded.checks import refused
 from grounded.filter.kalman import (
     Gains,
     LinearSystem,
@@ -32,15 +43,129 @@ from grounded.filter.kalman import (
     smoother,
     updated,
 )
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array
 from grounded.model import Model
 
+START_STD = 1.0  # prior standard deviation of an unmeasured first state, in its unit
 FLOOR = 1e-4  # smallest std, as a fraction of the visible scatter
 ROUNDS = 30  # most steps towards the likeliest noise
 LAST_GAIN = 0.05  # [nats] a step that gains less is the last
 TRUSTED = np.log(100.0)  # largest change of a log variance in a step
 SHORTEST = 0.05  # smallest fraction of a step that is tried
 ROWS = 8_000  # samples; more add little information about the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """One run with n states and m inputs.
+
+    Args:
+        times: instants at which states are estimated, evenly spaced [s], (T + 1,).
+        measured: measured states, NaN where nothing was measured, (T + 1, n).
+        command_times: times at which commands were sent, ascending [s], (M,).
+        commands: commands, each held from its time on, (M, m).
+        past: command held before the first one, (m,).
+        start: prior mean of the first state, used for states without a measurement, (n,); None for
+            zero.
+        start_std: prior standard deviation of the first state, (n,); None for 1 in each unit.
+    """
+
+    times: Array
+    measured: Array
+    command_times: Array
+    commands: Array
+    past: Array
+    start: Array | None = None
+    start_std: Array | None = None
+
+    @property
+    def steps(self) -> int:
+        """T, the number of steps."""
+        return len(self.times) - 1
+
+    def received(self, latency: Array) -> Array:
+        """Return the inputs received over each step, (T, m).
+
+        Args:
+            latency: latency of each input [s], (m,).
+        """
+        total = [self._integral(self.times - late, j) for j, late in enumerate(latency)]
+        return np.diff(np.stack(total, axis=1), axis=0) / np.diff(self.times)[:, None]
+
+    def _integral(self, t: Array, j: int) -> Array:
+        """Return the integral of command j from the first command to t."""
+        knots, values = self.command_times, np.append(self.past[j], self.commands[:, j])
+        total = np.append(0.0, np.cumsum(values[1:-1] * np.diff(knots)))
+        index = np.searchsorted(knots, t, side="right")
+        at = np.maximum(index - 1, 0)
+        return np.asarray(total[at] + values[index] * (t - knots[at]))
+
+
+def cut(record: Record, seconds: float) -> list[Record]:
+    """Cut a record into pieces of about `seconds`, each with its own unknown start state.
+
+    Filters run over many pieces at once, so half an hour takes little longer than a minute.
+    """
+    span = record.times[-1] - record.times[0]
+    pieces = max(1, round(span / seconds))
+    edges = np.linspace(0, record.steps, pieces + 1).round().astype(int)
+    return [part(record, int(a), int(b)) for a, b in pairwise(edges)]
+
+
+def part(record: Record, first: int, last: int) -> Record:
+    """Return rows first .. last of a record with all commands (latency needs earlier ones)."""
+    rows = slice(first, last + 1)
+    return replace(record, times=record.times[rows], measured=record.measured[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class RecordBatch:
+    """B records of at most T steps of dt; n states, m inputs."""
+
+    dt: float  # [s]
+    y: Array  # (T + 1, B, n), zero where not seen
+    seen: Any  # (T + 1, B, n) of bool
+    u: Array  # (T, B, m) inputs as received
+    valid: Any  # (T, B) of bool
+    start: Array  # (B, n) mean of the first state
+    start_var: Array  # (B, n) its variance, without the measurement noise
+    sampled: Any  # (B, n) of bool: the start is a sample, and has its noise
+
+    @property
+    def count(self) -> int:
+        """Number of samples in the likelihood."""
+        return int(self.seen.sum())
+
+
+def batch_of(records: Sequence[Record], latency: Array | None = None) -> RecordBatch:
+    """Combine records of one step size to a batch.
+
+    A measured state starts at its first sample, with that sample's noise; the sample is then not
+    used a second time. If it was measured only later, it may have changed by as much as it varies.
+
+    Args:
+        records: at least one record.
+        latency: latency of each input [s], (m,); None for zero.
+    """
+    (_, n), m, B = records[0].measured.shape, records[0].commands.shape[1], len(records)
+    T, late = max(r.steps for r in records), np.zeros(m) if latency is None else latency
+    y, u = np.full((T + 1, B, n), np.nan), np.zeros((T, B, m))
+    start, var, sampled = np.zeros((B, n)), np.empty((B, n)), np.zeros((B, n), dtype=bool)
+    for b, record in enumerate(records):
+        y[: record.steps + 1, b], u[: record.steps, b] = record.measured, record.received(late)
+        start[b] = 0.0 if record.start is None else record.start
+        var[b] = np.square(START_STD if record.start_std is None else record.start_std)
+        for i in range(n):
+            known_at = np.flatnonzero(np.isfinite(record.measured[:, i]))
+            if len(known_at):
+                start[b, i], sampled[b, i] = record.measured[known_at[0], i], known_at[0] == 0
+                spread = max(float(np.var(record.measured[known_at, i])), 1e-12)
+                var[b, i] = 0.0 if sampled[b, i] else spread
+    seen = np.isfinite(y)
+    seen[0] = False
+    valid = np.arange(T)[:, None] < np.array([r.steps for r in records])
+    dt = round(float(records[0].times[1] - records[0].times[0]), 9) if T else 1.0
+    return RecordBatch(dt, np.where(seen, y, 0.0), seen, u, valid, start, var, sampled)
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,30 +176,18 @@ class NoiseStd:
         process: process noise w over `dt`, (n,); over a step h it is process * sqrt(h / dt).
         measurement: measurement noise v, (n,); of states that nothing measures it has no part.
         dt: step that `process` refers to [s].
-
-    Raises:
-        GroundedError: if a value is negative or not finite, or a measurement noise is zero.
     """
 
     process: Array
     measurement: Array
     dt: float
 
-    def __post_init__(self) -> None:
-        for name in ("process", "measurement"):
-            value = readonly(getattr(self, name))
-            if value.ndim != 1 or not np.isfinite(value).all() or (value < 0).any():
-                raise wrong(f"{name} noise", value, must="weights")
-            object.__setattr__(self, name, value)
-        if (self.measurement == 0).any():
-            raise wrong("measurement noise", self.measurement, must="above")
-
 
 @dataclass(frozen=True, eq=False)
 class Estimated:
-    """Estimated states of one record, by the filter or the smoother.
+    """Smoothed states of one record.
 
-    `innovations` are the filter's in both cases, whitened; NaN where nothing was measured.
+    `innovations` are the filter's, whitened; NaN where nothing was measured.
     """
 
     states: Array  # (T + 1, n)
@@ -89,7 +202,6 @@ def smoothed(
     noise: NoiseStd,
     *,
     latency: Array | None = None,
-    forward: bool = False,
 ) -> list[Estimated]:
     """Estimate the states of each record with the smoother, from all of its measurements.
 
@@ -101,12 +213,10 @@ def smoothed(
         records: at least one, all of one step size.
         noise: process and measurement noise, see `process_noise`.
         latency: transport delay of each input [s], (m,); None for zero.
-        forward: use the extended Kalman filter alone, so that each estimate depends only on
-            measurements up to its time.
     """
     batch = batch_of(records, latency)
     one = filtered(model, batch, noise)
-    x = one.x if forward or not np.isfinite(one.loglik) else smooth(one)
+    x = smooth(one) if np.isfinite(one.loglik) else one.x
     found = []
     for b, record in enumerate(records):
         rows = slice(0, record.steps + 1)
