@@ -4,8 +4,7 @@ Compiling takes a tenth of a second, loading a cached object a millisecond, with
 takes thirty to import (`object_file.py`). Kernels are called through ctypes, which releases the GIL
 while they run: threads are enough for many models or trials (`grounded.engine`).
 
-The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code; and
-one file a machine, what LLVM said of it, which holds until it is started again. A
+The cache is the user's: one file a kernel, of a header, the SHA-256 of the code, and the code. A
 file that is short, damaged or of another format is not used and is replaced; a file or folder that
 is not the user's, or that others may write, is not used at all. A file is written
 under a temporary name and renamed, so that any number of processes may share the folder; beyond
@@ -33,50 +32,30 @@ from grounded.trusted import suspicion
 OPTIMISATION = 1  # of LLVM's code generator; the text is optimised as it is written
 MAGIC = b"grounded kernel 1\n"
 MAX_BYTES = 64 * 2**20  # of all files
-KERNEL, MACHINE = ".kernel", ".machine"  # kinds of files
-BOOT = Path("/proc/sys/kernel/random/boot_id")  # of Linux: another one each time it is started
+KERNEL = ".kernel"  # the usual kind of file
+CPU, CPU_BYTES = Path("/proc/cpuinfo"), 8192  # of Linux; more than it says of the first CPU
+CPU_LINES = ("vendor_id", "cpu family", "model", "stepping", "flags", "CPU ", "Features")
 _LOCK = threading.Lock()
 
 
 @cache
-def _host() -> tuple[str, str, str]:
-    """CPU name, its features, and everything that makes compiled code fit here and now."""
-    if (known := _remembered()) is not None:
-        return known
-    import llvmlite
+def _host() -> tuple[str, str]:
+    """CPU name and its features, as LLVM has them."""
     import llvmlite.binding as llvm
 
-    name, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    version = ".".join(str(v) for v in llvm.llvm_version_info)
-    triple = llvm.get_process_triple()
-    found = name, features, f"{llvmlite.__version__} {version} {triple} {name} {features}"
-    if digest := _here():
-        store(digest, "\n".join(found).encode(), MACHINE)
-    return found
-
-
-def _remembered() -> tuple[str, str, str] | None:
-    """What LLVM said of this machine since it was started; None if it was not asked."""
-    digest = _here()
-    said = stored(digest, MACHINE) if digest else None
-    if said is None:
-        return None
-    name, features, whole = said.decode().split("\n")
-    return name, features, whole
+    return llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
 
 
 @cache
-def _here() -> str:
-    """A hash of this machine, from its start to its end, and of LLVM; "" where none is known."""
+def _fits() -> str:
+    """What makes compiled code fit here: LLVM's version and the CPU, as Linux or LLVM tells it."""
     import llvmlite
 
-    try:
-        started = BOOT.read_text()
-        own = (Path(llvmlite.__file__).parent / "binding" / "libllvmlite.so").stat()
-    except OSError:
-        return ""
-    about = f"{started} {llvmlite.__version__} {own.st_size} {own.st_mtime_ns}"
-    return hashlib.sha256(about.encode()).hexdigest()
+    said = ""
+    with contextlib.suppress(OSError), CPU.open() as file:
+        first = file.read(CPU_BYTES).partition("\n\n")[0].splitlines()
+        said = "\n".join(line for line in first if line.startswith(CPU_LINES))
+    return f"{llvmlite.__version__} {said or ' '.join(_host())}"
 
 
 def _machine() -> Any:
@@ -89,7 +68,7 @@ def _machine() -> Any:
 
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    name, features, _ = _host()
+    name, features = _host()
     return llvm.Target.from_default_triple().create_target_machine(
         cpu=name, features=features, opt=OPTIMISATION, reloc="static", codemodel="large", jit=True
     )
@@ -134,7 +113,7 @@ def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library
         names: functions wanted, each `(words: ptr) -> i64 or void`.
     """
     with _LOCK:  # LLVM's global context is not thread safe
-        digest = hashlib.sha256(f"{key} {_host()[2]}".encode()).hexdigest()
+        digest = hashlib.sha256(f"{key} {_fits()}".encode()).hexdigest()
         code = stored(digest)
         if code is None:
             code = _compiled(write())
@@ -241,7 +220,7 @@ def _check(digest: str, code: bytes) -> bytes:
 def _prune(home: Path) -> None:
     """Removes the files that were used longest ago until MAX_BYTES are left."""
     entries = []
-    for path in (path for kind in (KERNEL, MACHINE) for path in home.glob(f"*{kind}")):
+    for path in home.glob(f"*{KERNEL}"):
         with contextlib.suppress(OSError):
             status = path.stat()
             entries.append((status.st_mtime, status.st_size, path))
