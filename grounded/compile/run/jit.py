@@ -55,7 +55,10 @@ def _fits() -> str:
     with contextlib.suppress(OSError), CPU.open() as file:
         first = file.read(CPU_BYTES).partition("\n\n")[0].splitlines()
         said = "\n".join(line for line in first if line.startswith(CPU_LINES))
-    return f"{llvmlite.__version__} {said or ' '.join(_host())}"
+    if not said:
+        name, features = _host()
+        said = " ".join([name, *(one for one in features.split(",") if one.startswith("+"))])
+    return f"{llvmlite.__version__} {said}"
 
 
 def _machine() -> Any:
@@ -77,7 +80,7 @@ def _machine() -> Any:
 @cache
 def lanes() -> int:
     """Doubles in the widest vector of this machine, 4 or 8."""
-    return 8 if "+avx512f" in _host()[1].split(",") else 4
+    return 8 if "avx512f" in _fits() else 4
 
 
 @cache
