@@ -6,7 +6,7 @@
 | in the file            | in the model                                                           |
 |------------------------|------------------------------------------------------------------------|
 | hinge, slide `elbow`   | states `elbow`, `elbow_vel`; a hinge without limits is an angle        |
-| ball joint `wrist`     | `wrist_rx _ry _rz`: rotation vector from the reference pose, in the    |
+| ball joint `wrist`     | `wrist_rx _ry _rz`: rotation vector from the file's pose, in the       |
 |                        | frame of that pose; `wrist_wx _wy _wz`: angular velocity, body frame   |
 | free joint `torso`     | `torso_x _y _z`, `torso_rx ...`, `torso_vx ...`, `torso_wx ...`        |
 | actuator activation    | `motor_act`                                                            |
@@ -34,7 +34,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.adapters.files import load, located
-from grounded.adapters.mujoco_body import MujocoBody
 from grounded.adapters.mujoco_names import (
     BALL,
     FREE,
@@ -52,7 +51,7 @@ from grounded.adapters.mujoco_names import (
 )
 from grounded.adapters.stepper import Stepper, library, model_of
 from grounded.adapters.tangent import Coordinates
-from grounded.checks import refused, unknown, wrong
+from grounded.checks import refused, wrong
 from grounded.compile.run.interpreted import stencil
 from grounded.engine import cores
 from grounded.frozen import Array
@@ -76,8 +75,6 @@ def model(
     inputs: str | Sequence[str] = "auto",
     without: str | Sequence[str] = (),
     timestep: float | None = None,
-    reference: str | Sequence[float] | None = None,
-    threads: int | None = None,
     name: str = "",
 ) -> Model:
     """Return the Model of an MJCF or URDF file.
@@ -93,15 +90,11 @@ def model(
             (value, low, high) also sets its value. Other values are taken from the file.
         inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
             joints driven by a torque, or "auto": actuators if there are any, else torques.
-        without: joints that stay where the reference pose has them and are no states; "unmoved":
+        without: joints that stay where the file's pose (qpos0) has them and are no states; "unmoved":
             those that no actuator can move, such as a goal marker's, as nothing connects them to
             one and their geoms touch nothing. Without actuators, torques drive all joints.
         timestep: simulation step [s] in place of the file's; dt must be a whole multiple of it to
             within 0.1 %, and the rest is distributed over its steps.
-        reference: pose that rotation vectors refer to: qpos (nq,) or the name of a keyframe; None
-            for the file's qpos0.
-        threads: number of threads for a batch; None for all cores, at most 8. The result does not
-            depend on it.
         name: name of the model; by default the file's.
 
     Raises:
@@ -114,7 +107,7 @@ def model(
     compiled = load(xml)
     if timestep is not None:
         compiled.opt.timestep = timestep
-    coordinates = _coordinates(compiled, _reference(compiled, reference))
+    coordinates = _coordinates(compiled)
     every = states_of(compiled)
     controls = controls_of(compiled, inputs, every)
     left_out = unmoved_joints(compiled) if isinstance(without, str) else tuple(without)
@@ -123,8 +116,7 @@ def model(
     named = params if isinstance(params, Mapping) else dict.fromkeys(params, None)
     settings = [setting_of(mj, compiled, spec) for spec in named]
     values = {s.name: s.param(given) for s, given in zip(settings, named.values(), strict=True)}
-    several = threads or min(cores(), MOST_THREADS)
-    stepper = MujocoStepper(compiled, coordinates, states, kept, controls, settings, several)
+    stepper = MujocoStepper(compiled, coordinates, states, kept, controls, settings)
     stepper.without = left_out
     on_disk = isinstance(xml, Path) or (isinstance(xml, str) and not xml.lstrip().startswith("<"))
     stepper.source = located(xml).resolve() if on_disk else None
@@ -172,7 +164,6 @@ class MujocoStepper(Stepper):
         kept: NDArray[np.bool_],  # of the file's states, those of the model
         controls: Controls,
         settings: Sequence[Setting],
-        threads: int,
     ) -> None:
         super().__init__(states, controls.names, [s.name for s in settings])
         mj = library("mujoco")
@@ -180,7 +171,7 @@ class MujocoStepper(Stepper):
         pose = coordinates.from_qpos(coordinates.reference[None], np.zeros((1, compiled.nv)))[0]
         self._still = np.append(pose, np.zeros(compiled.nv + compiled.na))
         self.coordinates, self.controls, self.settings = coordinates, controls, tuple(settings)
-        self.threads = threads
+        self.threads = min(cores(), MOST_THREADS)
         self._model = copy.deepcopy(compiled)
         late = getattr(self._model, "actuator_delay", np.zeros(compiled.nu))
         self.latency = dict[str, float]()  # [s] of the inputs that the file delays
@@ -248,12 +239,9 @@ class MujocoStepper(Stepper):
     @property
     def body(self) -> MujocoBody:
         """The body to draw in pictures."""
-        mj = library("mujoco")
-        compiled = copy.deepcopy(self._model)
-        data = mj.MjData(compiled)
-        return MujocoBody(compiled, data, self.coordinates, mj.mj_kinematics, self._whole)
+        return MujocoBody(self)
 
-    def _whole(self, x: Array) -> Array:
+    def whole(self, x: Array) -> Array:
         """Return all states of the file, (N, nv + nv + na), for those of the model, (N, n)."""
         whole = np.tile(self._still, (len(x), 1))
         whole[:, self._kept] = x
@@ -327,7 +315,7 @@ class MujocoStepper(Stepper):
         if self._model.na:
             return None
         nv, mj = self._model.nv, library("mujoco")
-        x, after = self._whole(x), self._whole(after)
+        x, after = self.whole(x), self.whole(after)
         rate = (after[:, nv:] - x[:, nv:]) / dt
         found = np.empty((len(x), len(self.inputs)))
         with self._lock, _quiet():
@@ -396,7 +384,7 @@ class MujocoStepper(Stepper):
     def _step(self, x: Array, u: Array, steps: int, models: Any) -> Array:
         """Run simulation steps; `models` is one model, or a list with one for each sample."""
         mj, compiled, nv = library("mujoco"), self._model, self._model.nv
-        x = self._whole(x)
+        x = self.whole(x)
         given = np.hstack([x, u])
         wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
         x, u = np.where(wild, 0.0, x), np.where(wild, 0.0, u)
@@ -434,21 +422,7 @@ def _quiet() -> Iterator[None]:
         mj.set_mju_user_warning(heard)
 
 
-def _reference(compiled: Any, given: str | Sequence[float] | None) -> Array:
-    if given is None:
-        return np.array(compiled.qpos0)
-    if isinstance(given, str):
-        keys = [compiled.key(i).name for i in range(compiled.nkey)]
-        if given not in keys:
-            raise unknown("keyframe", given, keys)
-        return np.array(compiled.key(given).qpos)
-    found = np.array(given, dtype=float)
-    if found.shape != (compiled.nq,):
-        raise wrong("reference", found.shape, shape=f"({compiled.nq},)")
-    return found
-
-
-def _coordinates(compiled: Any, reference: Array) -> Coordinates:
+def _coordinates(compiled: Any) -> Coordinates:
     plain: list[int] = []
     columns: list[int] = []
     quaternions: list[int] = []
@@ -467,5 +441,48 @@ def _coordinates(compiled: Any, reference: Array) -> Coordinates:
         np.array(columns, dtype=np.int64),
         tuple(quaternions),
         tuple(rotations),
-        reference,
+        np.array(compiled.qpos0),
     )
+
+
+class MujocoBody:
+    """The body of a model, drawn in recordings: its joints, moved by MuJoCo's kinematics."""
+
+    unit = "m"
+
+    def __init__(self, stepper: MujocoStepper) -> None:
+        mj = library("mujoco")
+        self._stepper, self._model = stepper, copy.deepcopy(stepper._model)
+        self._data, self._kinematics = mj.MjData(self._model), mj.mj_kinematics
+        self._parents = np.array(self._model.body_parentid)
+        massive = np.flatnonzero(self._model.body_mass > 0)
+        self._watched = int(massive.max(initial=0))
+
+    def sticks(self, states: Array) -> Array:
+        """Return lines from each body's frame to its parent's, and to its centre of mass.
+
+        Args:
+            states: (T, n).
+
+        Returns:
+            Ends of the lines (T, S, 2, 3); NaN where a joint is unknown.
+        """
+        origins, centres = self._places(states)
+        inner = np.flatnonzero(self._parents > 0)  # what hangs on the world has no line to it
+        bones = np.stack([origins[:, self._parents[inner]], origins[:, inner]], axis=2)
+        return np.hstack([bones, np.stack([origins, centres], axis=2)[:, 1:]])
+
+    def path(self, states: Array) -> Array:
+        """Return positions (T, 3) of the last body's centre of mass; NaN if a joint is unknown."""
+        return self._places(states)[1][:, self._watched]
+
+    def _places(self, states: Array) -> tuple[Array, Array]:
+        """Return the origins and the centres of mass of all bodies, (T, bodies, 3) each."""
+        origins = np.full((len(states), self._model.nbody, 3), np.nan)
+        centres = origins.copy()
+        positions = self._stepper.whole(np.asarray(states, float))[:, : self._model.nv]
+        for t in np.flatnonzero(np.isfinite(positions).all(axis=1)):
+            self._data.qpos[:] = self._stepper.coordinates.to_qpos(positions[t : t + 1])[0]
+            self._kinematics(self._model, self._data)
+            origins[t], centres[t] = self._data.xpos, self._data.xipos
+        return origins, centres

@@ -206,8 +206,9 @@ def test_free_body_turns_on_past_a_full_turn() -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-def test_batches_are_single_samples_bit_for_bit(threads: int) -> None:
-    model = adapter.model(ARM.format(**NOMINAL), threads=threads)
+def test_batches_are_single_samples_bit_for_bit(threads: int, monkeypatch) -> None:
+    monkeypatch.setattr(adapter, "cores", lambda: threads)
+    model = adapter.model(ARM.format(**NOMINAL))
     rng = np.random.default_rng(3)
     many = 2 * adapter.SHARED  # enough samples for several threads
     x, u = rng.normal(size=(many, 5)), rng.normal(size=(many, 2))
@@ -243,8 +244,6 @@ def test_derivatives_are_those_of_central_differences() -> None:
         ({"params": ("mass",)}, "'pole.mass'"),
         ({"inputs": ("hinges",)}, "did you mean 'hinge'"),
         ({"inputs": "torque"}, "inputs must be"),
-        ({"reference": "home"}, "no keyframe"),
-        ({"reference": (0.0, 1.0)}, "reference"),
     ],
 )
 def test_what_is_not_in_the_file_is_said(options: dict[str, Any], message: str) -> None:
@@ -277,8 +276,8 @@ MARKED = """
 
 
 def test_a_body_without_mass_can_carry_a_payload():
-    empty = adapter.model(MARKED.format(mass=0, touches=0), params=("tool.mass",), threads=1)
-    loaded = adapter.model(MARKED.format(mass=1.5, touches=0), threads=1)
+    empty = adapter.model(MARKED.format(mass=0, touches=0), params=("tool.mass",))
+    loaded = adapter.model(MARKED.format(mass=1.5, touches=0))
     x, u = np.array([[-1.0, 0.0, 0.5, 0.0]]), np.array([[1.0]])
     by = empty.system.step(x, u, np.array([1.5]), 0.05)
     assert np.allclose(by, loaded.system.step(x, u, loaded.values, 0.05), rtol=1e-12)
