@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from grounded.engine import Engine
-from grounded.experiments import car, flight, footnote9, theorem1
+from grounded.experiments import car, flight, theory
 from grounded.refusals import wrong
 from grounded_cli.console.options import misuse
 from grounded_cli.console.terminal import bar, show, table
@@ -17,8 +17,8 @@ from grounded_cli.console.terminal import bar, show, table
 STUDIES: dict[str, tuple[Callable[..., Any], str, str]] = {
     "flight": (flight.run, "count", "Table 1"),
     "car": (car.run, "seeds", "Figures 4, 5"),
-    "footnote9": (footnote9.run, "", "footnote 9"),
-    "theorem1": (theorem1.run, "seeds", "theorem 1"),
+    "footnote9": (theory.footnote9, "", "footnote 9"),
+    "theorem1": (theory.theorem1, "seeds", "theorem 1"),
 }
 
 

@@ -90,8 +90,8 @@ def model(
             (value, low, high) also sets its value. Other values are taken from the file.
         inputs: "actuators", "torques" (generalised forces on all hinges and slides), the names of
             joints driven by a torque, or "auto": actuators if there are any, else torques.
-        without: joints that stay where the file's pose (qpos0) has them and are no states; "unmoved":
-            those that no actuator can move, such as a goal marker's, as nothing connects them to
+        without: joints that stay where the file's pose has them and are no states; "unmoved": those
+            that no actuator can move, such as a goal marker's, as nothing connects them to
             one and their geoms touch nothing. Without actuators, torques drive all joints.
         timestep: simulation step [s] in place of the file's; dt must be a whole multiple of it to
             within 0.1 %, and the rest is distributed over its steps.

@@ -1,7 +1,7 @@
 """Unmodelled effects that a model may lack, one file per kind of physics.
 
 Read `family` first, which defines an effect, then any of the kinds: `actuator`, `joint`,
-`friction`, `rate`, `geometry`, `medium`, `sensor`. `grounded.places` finds where effects can act.
+`rate`, `geometry`, `medium`, `sensor`. `grounded.places` finds where effects can act.
 `registry` has the `Library` of all families: it lists the effects that apply to a model and builds
 an effect from its name. `wrap` adds an effect to a model and returns a plain model again; `sensed`
 handles delayed logs beside true values. A new family is a value in one of these files, or comes

@@ -26,7 +26,7 @@ import numpy as np
 
 from grounded import places
 from grounded.checks import refused, unknown
-from grounded.effects import actuator, elastic, friction, geometry, joint, medium, rate, sensor
+from grounded.effects import actuator, elastic, geometry, joint, medium, rate, sensor
 from grounded.effects.drive import speed_weights
 from grounded.effects.family import (
     Effect,
@@ -68,7 +68,7 @@ BUILT_IN: tuple[Family, ...] = (
     *joint.FAMILIES,
     *elastic.FAMILIES,
     *rate.FAMILIES,
-    *friction.FAMILIES,
+    *rate.FRICTION,
     *geometry.FAMILIES,
     *medium.FAMILIES,
     *sensor.FAMILIES,

@@ -5,8 +5,8 @@ and a result with `to_json` and `tables`:
 
     flight           Table 1: an aircraft's figure-8 (task: `figure8`)
     car              Figures 4 and 5: three manoeuvres of the RC car (`car_tasks`, `real_car`)
-    theorem1, footnote9  the paper's theoretical results
+    theory           the paper's theoretical results
     pendulum         the smallest example, for `grounded demo`
 
-Read `footnote9` first (the smallest), then `car`.
+Read `footnote9` in `theory` first (the smallest), then `car`.
 """

@@ -5,12 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from grounded.experiments import (
-    car,
-    flight,
-    footnote9,
-    theorem1,
-)
+from grounded.experiments import car, flight, theory
 
 
 def plain(result):
@@ -56,7 +51,7 @@ def test_an_unstable_first_controller_is_discarded(monkeypatch):
 
 
 def test_footnote9_is_solved_in_one_iteration():
-    document = plain(footnote9.run((1.0, 5.0, 30.0)))
+    document = plain(theory.footnote9((1.0, 5.0, 30.0)))
     for row in document["rows"]:
         assert row["solved"] == pytest.approx(1.0, abs=1e-9)
         assert row["solved_trials"] == 2
@@ -65,7 +60,7 @@ def test_footnote9_is_solved_in_one_iteration():
 
 @pytest.mark.slow
 def test_theorem1_has_its_slopes_and_keeps_its_bound():
-    result = theorem1.run(range(1), epsilons=(0.01, 0.1))
+    result = theory.theorem1(range(1), epsilons=(0.01, 0.1))
     document = plain(result)
     assert document["slopes"]["gradient_error"]["slope"] == pytest.approx(1.0, abs=0.1)
     assert document["slopes"]["squared_gradient"]["slope"] == pytest.approx(2.0, abs=0.2)
@@ -74,7 +69,7 @@ def test_theorem1_has_its_slopes_and_keeps_its_bound():
 
 
 def test_the_model_of_theorem1_is_wrong_by_epsilon():
-    task = theorem1.theorem1_task(0.1, 0)
+    task = theory.theorem1_task(0.1, 0)
     truth = task.model.with_values({"eps": 0.0})
     rng = np.random.default_rng(0)
     x, u = rng.normal(size=(200, 2)), rng.normal(size=(200, 1))
