@@ -356,8 +356,8 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         names = [n for n in model.states if units[n] in wanted]
         return [str(rng.choice(names))] if draw and names else names
 
-    def times(names: Sequence[str], by: float) -> list[Trial]:
-        return _set(trials, lambda c: c.update({n: by * c[n] for n in names}))
+    def times(names: Sequence[str], by: float, some: Sequence[Trial] = trials) -> list[Trial]:
+        return _set(some, lambda c: c.update({n: by * c[n] for n in names}))
 
     def shifted(names: Sequence[str], steps: float) -> list[Trial]:
         def moved(x: Array) -> Array:
@@ -469,6 +469,31 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         c[name][10::31] = gone
 
     yield fault("drop-outs", "dropout", [name], _set(trials, drops))
+
+    # much noise, a robot that stands, and several trials of which one is wrong
+    def shaken(trial: Trial, size: float) -> Trial:
+        noise = size * np.array(robot.noise) * rng.normal(size=trial.states.shape)
+        return replace(trial, states=trial.states + noise)
+
+    def at_rest(trial: Trial) -> Trial:
+        moves = np.array([unit.endswith("/s") for unit in model.states.values()])
+        still = np.broadcast_to(np.where(moves, 0.0, trial.states[0]), trial.states.shape)
+        return shaken(replace(trial, states=still, inputs=0.0 * trial.inputs), 1.0)
+
+    noisy, rest = [shaken(one, 5.0) for one in trials], [at_rest(one) for one in trials]
+    many = [*trials, *driven(robot, rng, 4)]
+    for name, logs in (("noisy", noisy), ("at rest", rest), ("one at rest", [rest[0], trials[1]])):
+        yield Fault(f"{name}: sound", "none", (), logs)
+        if name != "at rest":
+            yield fault(f"{name}: degrees", "unit", angle, times(angle, DEGREES, logs))
+    yield Fault("six: sound", "none", (), many)
+    yield fault("one of six: degrees", "unit", angle, [*times(angle, DEGREES, many[:1]), *many[1:]])
+    yield fault("six: degrees", "unit", angle, times(angle, DEGREES, many))
+    if rate:
+        yield fault("noisy: rate's sign", "sign", rate, times(rate, -1.0, noisy))
+        yield fault("one of six: sign", "sign", rate, [*times(rate, -1.0, many[:1]), *many[1:]])
+    if length:
+        yield fault("noisy: millimetres", "unit", lengths, times(lengths, 1e3, noisy))
 
 
 # --- candidates -----------------------------------------------------------------------------------
