@@ -13,14 +13,11 @@ from grounded.accounts.motion import FEWEST_SAMPLES
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.result import extent
-from grounded.task import Task
 from grounded.trial import Trial
 
 STUCK = 8  # equal samples before a jump
 HELD = 0.8  # share of runs longer than one sample, above which the sensor is slower than the log
 FULL_TURNS = (2 * np.pi, 360.0)
-ROUNDED = 0.01  # of the largest command: an excess below this is rounding
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,31 +175,3 @@ def quantum(columns: Sequence[Array]) -> float:
     step = float(np.median(small))
     whole = np.abs(gaps / step - np.rint(gaps / step)) < 0.02 * np.maximum(np.rint(gaps / step), 1)
     return step if len(small) > 0.2 * len(gaps) and whole.mean() > 0.95 else 0.0
-
-
-# --- commands -------------------------------------------------------------------------------------
-
-
-def beyond_limits(task: Task, inputs: Array) -> Array:
-    """Return by how much each command (T, m) exceeds its limits, in its unit; 0 inside them.
-
-    Args:
-        task: with the limits.
-        inputs: the commands (T, m) of a log; NaN counts as 0.
-    """
-    inputs = np.nan_to_num(inputs)
-    excess = np.maximum(task.low - inputs, inputs - task.high)
-    slack = ROUNDED * np.abs(inputs).max(axis=0, initial=0.0)
-    return np.asarray(np.where(excess > slack, excess, 0.0))
-
-
-def limits_of(task: Task, j: int) -> str:
-    """Return an input's limits as text, such as `0 to 1.17 m/s`."""
-    unit = task.model.inputs[task.model.input_names[j]]
-    return f"{span(np.array([task.low[j], task.high[j]]))}{'' if unit == '1' else f' {unit}'}"
-
-
-def span(values: Array) -> str:
-    """Return the range of all values as text, such as `-1.2 to 2.15`."""
-    low, high = extent(float(np.nanmin(values)), float(np.nanmax(values)))
-    return f"{low:.4g} to {high:.4g}"

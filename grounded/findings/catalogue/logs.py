@@ -91,9 +91,9 @@ LOG: dict[str, Entry] = {
         "to use it, add {about} = its scatter at standstill there",
     ),
     "limits": warn(
-        "{about} goes [[from {logged}]][[up to {most}]] beyond its [limits][[, {limits}]]",
-        "[[most? log the commands after clipping]][[{how:flip=its scale in [log] is negative: "
-        "multiply these limits by -1 too,widen=widen them if the robot can take it}]]",
+        "{about} goes up to {most} beyond its [limits], {limits}",
+        "{how:clip=log the commands after clipping,flip=its scale in [log] is negative: multiply "
+        "these limits by -1 too,widen=widen them if the robot can take it}",
     ),
     # what a log lacks
     "gaps": warn(

@@ -22,7 +22,7 @@ from grounded.accounts.sent import as_sent
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
-from grounded.result import NULL, UNSAID, Document
+from grounded.result import NULL, UNSAID, Document, with_unit
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.standing import Phase, Standing
 from grounded.task import Task
@@ -58,7 +58,7 @@ if TYPE_CHECKING:
     from grounded_trials.logs.signal_report import SignalReport
 
 FAULTS = (*COLUMNS, "run.exchanged")  # the next plan would be based on wrong columns
-ROUNDED = 1e-6  # of an input's unit: a smaller excess over its limits is rounding
+ROUNDED = 0.01  # of an input's largest command: a smaller excess over its limits is rounding
 ASIDE = "set aside"  # the verdict on a run that does not count
 
 
@@ -316,11 +316,7 @@ def _checked(workspace: Folder, trial: Trial, last_s: float = math.nan) -> Itera
         missing = max(0.0, np.nan_to_num(1e3 * (task.horizon * task.dt - last_s)))
         yield found("log.short", steps=whole.steps, horizon=task.horizon, missing=missing)
     whole = whole.until(task.horizon)
-    excess = np.maximum(task.low - whole.inputs, whole.inputs - task.high)
-    for i, most in enumerate(excess.max(axis=0, initial=0.0)):
-        if most > ROUNDED:
-            name = whole.input_names[i]
-            yield found("log.limits", name, most=Quantity(most, task.model.inputs[name]))
+    yield from _beyond(workspace, whole)
     candidate, _ = workspace.candidate(trial.candidate)
     if np.ptp(candidate.predicted_states, axis=0).any():
         yield from _still(whole)
@@ -368,15 +364,16 @@ def _still(trial: Trial) -> Iterator[Finding]:
 
 
 def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
-    """Yield logged inputs that exceed [limits], which were taken from another log."""
-    from grounded.accounts.signals import beyond_limits, limits_of, span
-
-    task, mapping = workspace.task, workspace.log_mapping
-    past = np.any(beyond_limits(task, trial.inputs), axis=0)
-    inside = ~np.any(beyond_limits(task, -trial.inputs), axis=0)
-    for i, name in enumerate(trial.input_names):
-        if past[i]:
-            turned = inside[i] and mapping is not None and mapping.inputs[name].scale < 0
-            how = "flip" if turned else "widen"
-            logged, limits = span(trial.inputs[:, i]), limits_of(task, i)
-            yield found("log.limits", name, logged=logged, limits=limits, how=how)
+    """Yield inputs that exceed [limits]: of data these were taken from another log."""
+    task, mapping, sent = workspace.task, workspace.log_mapping, np.nan_to_num(trial.inputs)
+    slack = ROUNDED * np.abs(sent).max(axis=0, initial=0.0)
+    past, turned = (
+        np.maximum(task.low - u, u - task.high).max(axis=0, initial=0.0) for u in (sent, -sent)
+    )
+    for i in np.flatnonzero(past > slack):
+        name, ends = trial.input_names[i], (float(task.low[i]), float(task.high[i]))
+        unit = task.model.inputs[name]
+        flip = turned[i] <= slack[i] and mapping is not None and mapping.inputs[name].scale < 0
+        how = "clip" if trial.candidate else "flip" if flip else "widen"
+        limits = f"{ends[0]:.4g} to {with_unit(f'{ends[1]:.4g}', unit)}"
+        yield found("log.limits", name, most=Quantity(float(past[i]), unit), limits=limits, how=how)
