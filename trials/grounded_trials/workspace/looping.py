@@ -24,7 +24,6 @@ from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
-from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 
 MOST_TRIALS = 100_000
 
@@ -100,6 +99,8 @@ def learn_in(
 
 def _odd_before(workspace: Folder) -> bool:
     """Return whether the last run's log had faults too, so that the user has chosen to go on."""
+    from grounded_trials.workspace.intake.remarks.log_faults import log_faults  # slow to load
+
     runs = [trial for trial in workspace.task_trials() if trial.candidate]
     return bool(runs) and bool(log_faults(workspace, runs[-1]))
 

@@ -48,8 +48,7 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     others_differ,
     repeated,
 )
-from grounded_trials.workspace.intake.remarks.gone_wrong import shown_by
-from grounded_trials.workspace.intake.remarks.log_faults import COLUMNS
+from grounded_trials.workspace.intake.remarks.gone_wrong import COLUMNS, shown_by
 from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import Situation, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of

@@ -1,8 +1,11 @@
-"""Ask whether a run went as it should: an input reversed, far astray, or ended early.
+"""Ask whether a run went as it should: sent otherwise, an input reversed, astray, or ended early.
 
 A motor wired the wrong way round, an encoder that slipped or a hand on the robot give a faultless
 log of a run that says nothing about its candidate. The next plan would be based on it. A log of
 other driving is asked about as well: with another that contradicts it, no diagnosis is possible.
+
+A run whose commands are its candidate's to the last digits, and whose motion is near its
+prediction, came about as it is logged: no story of its log or of its program is asked for then.
 
 A log does not tell whether the robot crashed at its end, somebody stopped it, or only the recording
 ended. But a robot that crashes leaves its prediction or [safety] first. If it was as near to its
@@ -20,7 +23,15 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from grounded.accounts.sent import STEPS_TO_JUDGE, as_planned, like_predicted
+from grounded.accounts.sent import (
+    LATEST,
+    STEPS_TO_JUDGE,
+    UNLIKE,
+    as_planned,
+    follows,
+    latest,
+    like_predicted,
+)
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import median
 from grounded.search.candidate import Candidate, Tried
@@ -28,21 +39,27 @@ from grounded.search.run_motion import reversed_input, signs_of
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.control_loop import ran_otherwise
 from grounded_trials.workspace.intake.remarks.initial_state import begun_elsewhere
-from grounded_trials.workspace.intake.remarks.log_faults import log_faults
 from grounded_trials.workspace.last_diagnosis import diagnosable
 
+KINDS = "unit sign compass exchange dead offset axes pace clock"
+COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
 STRAYED = 100.0  # the same, from where on a run went far astray
 NO_CRASH = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
 GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
+SAME = 0.4  # relative difference of two ages or lags that are one
 # last steps, in most of which a state has to be that far off: noise is not
 END = STEPS_TO_JUDGE // 2
 
 
 def gone_wrong(
-    workspace: Folder, trial: Trial, tried: Tried | None, history: Sequence[Tried]
+    workspace: Folder,
+    trial: Trial,
+    tried: Tried | None,
+    history: Sequence[Tried],
+    *,
+    planned: bool = False,
 ) -> Finding | None:
     """Return what seems wrong with a trial: an input reversed, or a run that went far astray.
 
@@ -51,6 +68,7 @@ def gone_wrong(
         trial: the trial as stored, with short gaps bridged.
         tried: its candidate with all of its runs; None if it ran none.
         history: all candidates with their runs.
+        planned: it came about as it is logged.
     """
     run, missed, usual = trial, 0.0, 1.0
     others = [t for t in history if t.utilities and t is not tried and math.isfinite(t.utility)]
@@ -62,7 +80,7 @@ def gone_wrong(
         cost = min(abs(t.utility) for t in others)
         off = np.array([abs(t.promised - t.utility) for t in others])
         usual = max(usual, cost, float(median(off)))
-    if tried is None or not as_planned(tried.candidate, run):
+    if not planned:
         astray = missed > SIGN_ASKED_FROM * usual
         if turned := reversed_input(workspace.planner, run, astray=astray):
             return _is_it_wired(workspace, trial, turned)
@@ -70,6 +88,35 @@ def gone_wrong(
         ran, times = tried.candidate.id, missed / usual
         return found("run.astray", ran=ran, trial=trial.id, missed=missed, times=times)
     return None
+
+
+def ran_otherwise(workspace: Folder, trial: Trial) -> Finding | None:
+    """Return how a program ran its candidate otherwise than planned; None if it did not.
+
+    Commands that are some steps late in a log were sent late or logged late: commands and states
+    alone do not tell which.
+
+    Args:
+        workspace: the workspace with the task and the candidate.
+        trial: the trial as stored.
+    """
+    from grounded.accounts.returned import Kind, stories  # of runs that are not as planned
+
+    if not trial.candidate:
+        return None
+    task, (own, _) = workspace.task, workspace.candidate(trial.candidate)
+    run = interpolate_gaps(trial).trial.until(task.horizon)
+    ran = follows(own.policy, run, max(LATEST, latest(task)))
+    some = stories(task, own, run, ran)
+    if some and some[0].kind is Kind.PROGRAM:
+        return some[0].finding
+    if ran is None or not (ran.alike and ran.late and ran.moved < UNLIKE):
+        return None
+    # the states acted on show a wrong start
+    late, side = ran.late, "late" if ran.late > 0 else "early"
+    start = late < 0 or ran.age <= (1 - SAME) * late
+    what = "start" if start else "either"
+    return found("log.late", ran=own.id, steps=abs(late), side=side, what=what)
 
 
 def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
@@ -164,9 +211,15 @@ def shown_by(
         doubted: its candidate was named against its commands.
         silent: states without a value in the rest of its log, where others have some.
     """
-    whole = interpolate_gaps(trial).trial
-    yield from log_faults(workspace, whole, own=own)
-    yield None if doubted else ran_otherwise(workspace, trial)
+    whole, ran = interpolate_gaps(trial).trial, trial.candidate
+    known = ran in workspace.candidate_ids()
+    candidate = workspace.candidate(ran)[0] if known else None
+    planned = candidate is not None and as_planned(candidate, whole.until(candidate.policy.horizon))
+    if not planned:
+        from grounded_trials.workspace.intake.remarks.log_faults import log_faults
+
+        yield from log_faults(workspace, whole, own=own)
+        yield None if doubted else ran_otherwise(workspace, trial)
     yield begun_elsewhere(workspace, trial)
-    yield gone_wrong(workspace, whole, tried, history)
+    yield gone_wrong(workspace, whole, tried, history, planned=planned)
     yield ended_early(workspace, trial, silent)

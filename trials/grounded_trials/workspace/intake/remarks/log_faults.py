@@ -16,19 +16,18 @@ import numpy as np
 from grounded.accounts.commands import clocks_apart
 from grounded.accounts.judge import contradicted, judge
 from grounded.accounts.reported import names_of, reported
-from grounded.accounts.sent import as_planned, follows, latest
+from grounded.accounts.sent import follows, latest
 from grounded.accounts.table import Account, Told
 from grounded.findings import Finding, found
 from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.remarks.gone_wrong import COLUMNS
 from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.readings import paths_of, read_by
 
 COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
-KINDS = "unit sign compass exchange dead offset axes pace clock"
-COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
 
 
 def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[Finding, ...]:
@@ -39,10 +38,6 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
         trial: the trial, with gaps bridged; of a long one its first steps are looked at.
         own: it was written by grounded, and not read through [log].
     """
-    if trial.candidate in workspace.candidate_ids():
-        ran, _ = workspace.candidate(trial.candidate)
-        if as_planned(ran, trial.until(ran.policy.horizon)):
-            return ()
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
     faults = column_faults(workspace, known)
