@@ -35,7 +35,6 @@ from grounded.accounts.sent import (
 from grounded.findings import Finding, Weight, found
 from grounded.frozen import median
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.run_motion import reversed_input, signs_of
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.workspace.folder import Folder
@@ -81,6 +80,8 @@ def gone_wrong(
         off = np.array([abs(t.promised - t.utility) for t in others])
         usual = max(usual, cost, float(median(off)))
     if not planned:
+        from grounded.search.run_motion import reversed_input
+
         astray = missed > SIGN_ASKED_FROM * usual
         if turned := reversed_input(workspace.planner, run, astray=astray):
             return _is_it_wired(workspace, trial, turned)
@@ -124,6 +125,8 @@ def _is_it_wired(workspace: Folder, trial: Trial, turned: Finding) -> Finding:
 
     If it did so in all of them, the model has the wrong sign: no run is at fault.
     """
+    from grounded.search.run_motion import signs_of
+
     each = [
         (one.id, signs_of(workspace.planner, one)[turned.about[0]])
         for one in diagnosable(workspace)
