@@ -31,7 +31,9 @@ def test_data_beyond_the_limits_are_told_how_far(w, tmp_path, most, said):
     write_trial(tmp_path / "d.mcap", driven(most), {"kind": "data"})
     told = of_code(w.ingest(tmp_path / "d.mcap", data=True), "log.limits")
     assert [(one.about, one.facts["how"]) for one in told] == [(("force",), "widen")] * said
-    assert [one.facts["most"].value for one in told] == pytest.approx([most - 1.17] * said, rel=1e-3)
+    assert [one.facts["most"].value for one in told] == pytest.approx(
+        [most - 1.17] * said, rel=1e-3
+    )
     assert all(holds(one.sentence, "force", "0 to 1.17 N") for one in told)
 
 
