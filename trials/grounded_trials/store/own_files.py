@@ -11,10 +11,10 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -44,6 +44,7 @@ RESERVED += ["candidate", "start_inputs", "start_states", "start_ns", "sha256"]
 
 Meta = Mapping[str, str]
 Units = Mapping[str, str]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,32 +75,31 @@ class OwnFile:
 
     def number(self, key: str) -> float:
         """Return a positive finite number from the metadata."""
-        text = self.entry(key)
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not (math.isfinite(value) and value > 0):
-            raise self.bad(key, text, must="positive")
-        return value
+        return self._parsed(key, float, lambda v: 0 < v < math.inf, must="positive")
 
     def integer(self, key: str, *, signed: bool = False) -> int:
-        """Return an integer from the metadata, not negative unless `signed`."""
-        text = self.entry(key)
-        digits = text[1:] if signed and text.startswith("-") else text
-        if not (digits.isascii() and digits.isdigit() and len(digits) < 20):
-            raise self.bad(key, text, must="whole")
-        return int(text)
+        """Return an integer of 64 bits from the metadata, not negative unless `signed`."""
+        low = -(2**63) if signed else 0
+        return self._parsed(key, int, lambda v: low <= v < 2**63, must="whole")
 
     def json(self, key: str, kind: type[list[Any] | dict[str, Any]]) -> Any:
         """Return a JSON list or object from the metadata."""
+
+        def fits(value: Any) -> bool:
+            return isinstance(value, kind) and len(value) <= NAME_LIMIT
+
+        return self._parsed(key, json.loads, fits, type=kind.__name__)
+
+    def _parsed(
+        self, key: str, parse: Callable[[str], T], fits: Callable[[T], bool], **expected: Any
+    ) -> T:
+        text = self.entry(key)
         try:
-            value = json.loads(self.entry(key))
+            if fits(value := parse(text)):
+                return value
         except (ValueError, RecursionError):
-            raise self.bad(key, self.meta[key], type="JSON") from None
-        if not isinstance(value, kind) or len(value) > NAME_LIMIT:
-            raise self.bad(key, value, type=kind.__name__)
-        return value
+            pass
+        raise self.bad(key, text, **expected)
 
     def names(self, key: str) -> list[str]:
         """Return the names of a JSON object of the metadata, in order."""

@@ -12,7 +12,7 @@ import sys
 import traceback
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from grounded.adapters.files import beside
 from grounded.checks import of_type, refused, unknown, wrong
@@ -21,9 +21,6 @@ from grounded.foreign import contained
 from grounded.model import Model
 from grounded.trusted import check_own
 from grounded_trials.workspace.user_files.config import FILE
-
-if TYPE_CHECKING:
-    from importlib.metadata import EntryPoint
 
 
 def load_module(
@@ -75,30 +72,26 @@ def load_module(
 
 def _installed(name: str) -> ModuleType:
     """Import a module by its name, or a model by its name among the entry points."""
-    registered: dict[str, EntryPoint] = {}
     try:
-        if not _importable(name):  # listing the entry points is slow
-            from importlib.metadata import entry_points
-
-            registered = {point.name: point for point in entry_points(group="grounded.models")}
-        if name in registered:
-            found = ModuleType(name)
-            with contained():
-                vars(found)["model"] = registered[name].load()
-            return found
         with contained():
             return importlib.import_module(name)
-    except ModuleNotFoundError:
-        raise unknown("module", name, registered, where="grounded.toml: [model] module") from None
+    except ModuleNotFoundError as error:
+        if not f"{name}.".startswith(f"{error.name}."):  # what it imports is missing
+            raise _failed(error, name) from None
     except Exception as error:
         raise _failed(error, name) from None
+    from importlib import metadata  # slow
 
-
-def _importable(name: str) -> bool:
+    registered = {point.name: point for point in metadata.entry_points(group="grounded.models")}
+    if name not in registered:
+        raise unknown("module", name, registered, where="grounded.toml: [model] module")
+    found = ModuleType(name)
     try:
-        return importlib.util.find_spec(name) is not None
-    except ModuleNotFoundError:  # its parent package is missing
-        return False
+        with contained():
+            vars(found)["model"] = registered[name].load()
+    except Exception as error:
+        raise _failed(error, name) from None
+    return found
 
 
 def _forget_neighbours(folder: Path, before: set[str]) -> None:
