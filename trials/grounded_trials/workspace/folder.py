@@ -148,7 +148,11 @@ class Folder:
     def _trials(self) -> tuple[tuple[StoredTrial, ...], tuple[Lost, ...], list[GroundedError]]:
         """The stored trials, the damaged and missing files, and the errors about damaged ones."""
         broken, found, errors = list[Lost](), list[StoredTrial](), list[GroundedError]()
-        known = noted(self.notes.read(broken))
+        try:
+            known = self.noted
+        except GroundedError as error:
+            errors.append(error)
+            known = noted(self.notes.read(broken))
         for stored in self.store.list():
             try:
                 if known.why_aside(stored) is None:
@@ -202,10 +206,8 @@ class Folder:
             candidates = tuple(self._read_candidates(trials, lost, errors))
             self._contents[names] = Contents(trials, candidates, tuple(lost), tuple(errors))
         found = self._contents[names]
-        if strict:
-            self.trials()
-            for error in found.errors:
-                raise error
+        for error in found.errors if strict else ():
+            raise error
         return found
 
     def trials(self) -> tuple[StoredTrial, ...]:
@@ -214,7 +216,6 @@ class Folder:
         Raises:
             GroundedError: if one, or a note, is damaged, naming it.
         """
-        _ = self.noted
         trials, _, errors = self._trials
         for error in errors:
             raise error
