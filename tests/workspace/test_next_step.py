@@ -260,10 +260,7 @@ def test_another_model_or_other_limits_make_a_diagnosis_old(w):
         file.write_text(text)
 
 
-@pytest.mark.parametrize("made_of_all", [False])
-def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
-    w, monkeypatch, made_of_all
-):
+def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(w, monkeypatch):
     from grounded_trials.workspace.candidates import search_state as module
 
     plainly = module.standing
@@ -271,15 +268,15 @@ def test_an_ended_search_asks_for_a_diagnosis_until_a_newer_one_is_made(
     (w.reports / "diagnosis.json").unlink()
     assert w.status().then == DIAGNOSE
     usable = [trial.id for trial in diagnosable(w)]
-    made = {"trials": usable if made_of_all else usable[:-1], "params": dict(w.config.model.params)}
-    diagnosed(w.folder, verdict=NONE, diagnosed=made)
-    assert w.status().then == (EXPORT if made_of_all else DIAGNOSE)
+    for seen, then in ((usable[:-1], DIAGNOSE), (usable, EXPORT)):
+        made = {"trials": seen, "params": dict(w.config.model.params)}
+        diagnosed(w.folder, verdict=NONE, diagnosed=made)
+        assert w.status().then == then
 
 
-@pytest.mark.parametrize(("runs", "then"), [(2, "export best --runner")])
-def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, runs, then):
+def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch):
     now = w.status().standing
-    best = replace(now.incumbent, trials=now.incumbent.trials[:1] * runs)
+    best = replace(now.incumbent, trials=now.incumbent.trials[:1] * 2)
     why = found("search.no_step", best="c0002", lost=2)
     doubtful = ended(replace(now, incumbent=best), Ending.NO_STEP, why, ASK)
     monkeypatch.setattr(
@@ -290,7 +287,7 @@ def test_what_was_diagnosed_and_adopted_is_not_diagnosed_again(w, monkeypatch, r
     w.adopt("viscous_friction:v")
     assert following(w.folder) == "diagnose"
     diagnosed(w.folder, diagnosed=taken_in(*range(1, count + 1)))
-    assert following(w.folder) == then
+    assert following(w.folder) == "export best --runner"
 
 
 def test_a_changed_model_that_promises_nothing_is_said_to(w):
@@ -363,9 +360,9 @@ def test_what_can_not_be_adopted_changes_nothing(w, changes, names, facts):
 
 
 @pytest.mark.parametrize("named", [True, False])
-@pytest.mark.parametrize(("finding", "effect"), [(DELAYED, {"name": "sensor_delay:v", "d": 0.03})])
-def test_a_late_sensor_is_adopted_with_the_physics(w, finding, effect, named):
-    diagnosed(w.folder, preflight=[finding])
+def test_a_late_sensor_is_adopted_with_the_physics(w, named):
+    diagnosed(w.folder, preflight=[DELAYED])
+    effect = {"name": "sensor_delay:v", "d": 0.03}
     done = w.adopt("viscous_friction:v", *[effect["name"]] * named)
     assert done.effects[-1] == effect and done.params == {"mass": 1.4}
     assert done.along == (() if named else (effect["name"],))
