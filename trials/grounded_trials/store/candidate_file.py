@@ -136,8 +136,6 @@ def read_candidate(
     if (len(x), H, len(u)) != (steps + 1, steps, steps):
         sizes, wants = (H, len(x), len(u)), (steps, steps + 1, steps)
         raise wrong(f"{own.name}: policy, states and inputs", sizes, shape=str(wants))
-    for topic in ("/policy", "/predicted_state", "/predicted_input"):
-        own.check_grid(topic, 0, policy.dt)
     if own.meta.get("sha256") not in (None, _hash(own.meta, [*_controls(policy), x, u])):
         raise refused("file.changed", own.name, what="candidate", then=NextCommand("propose"))
     return policy, x, u, own.meta

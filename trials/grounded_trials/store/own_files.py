@@ -10,8 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -35,7 +34,6 @@ from grounded_trials.formats.protobuf import double_tag, doubles_tag, numbers_in
 from grounded_trials.plain_file import read_file, unreadable
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
-STEP_LIMIT = 2_000_000  # messages per channel
 NAME_LIMIT = 1000  # number of states or of inputs
 
 TRIAL, CANDIDATE = "grounded trial 1", "grounded candidate 1"
@@ -181,7 +179,6 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     schemas: dict[int, Schema] = {}
     channels: dict[int, Channel] = {}
     messages: dict[str, list[Messages]] = {}
-    counts: Counter[str] = Counter()
     for record in read_records(source, name, packed=False):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
@@ -192,11 +189,10 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         elif isinstance(record, Channel):
             channels[record.id] = record
         elif isinstance(record, Messages):
-            for topic, own in _sorted(record, channels, name):
-                messages.setdefault(topic, []).append(own)
-                counts[topic] += len(own)
-                if counts[topic] > STEP_LIMIT:
-                    raise unreadable(name, f"> {STEP_LIMIT} messages")
+            for identity in record.channel_ids():
+                if identity not in channels:
+                    raise DamagedFile(name, 0, "record", "a message", f"channel {identity}")
+                messages.setdefault(channels[identity].topic, []).append(record.of(identity))
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "record", "its end", "no checksum")
     if meta is None or meta.get("format") != kind:
@@ -204,16 +200,6 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         raise unreadable(name, f"format {has}", kind=f"{kind} file")
     types = {c.topic: _type(c, schemas, name) for c in channels.values()}
     return OwnFile(name, source, meta, attachments, types, messages)
-
-
-def _sorted(
-    batch: Messages, channels: dict[int, Channel], name: str
-) -> Iterator[tuple[str, Messages]]:
-    """Yield the messages of a batch by topic."""
-    for identity in batch.channel_ids():
-        if identity not in channels:
-            raise DamagedFile(name, 0, "record", "a message", f"channel {identity}")
-        yield channels[identity].topic, batch.of(identity)
 
 
 def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Schema:
