@@ -223,8 +223,6 @@ def summary(marks: Marks) -> dict[str, Any]:
         }
         row["worse"] = _part(some, "worse")
         row |= OF_KIND[kind](some)
-        times = [m["cpu_s"] for m in some if "cpu_s" in m]
-        row["cpu_s_mean"] = float(np.mean(times)) if times else None
         found[kind] = row
     return found
 

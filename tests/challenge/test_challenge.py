@@ -79,13 +79,13 @@ def test_cases_are_run_and_scored_as_jobs_and_a_run_goes_on(tmp_path):
     done = {"verdict": {"kind": "none", "effects": []}, "ranking": [], "indistinguishable": []}
     done |= {"leftover": [], "gap": {"after": 1.0}}
     write_document(folder / "none-0000" / "reports" / "diagnosis.json", done)
-    assert list(say("run", str(folder))["cpu_s"]) == ["none-0001"]  # the other one had been
-    found = say("run", str(folder))
+    found = say("run", str(folder))  # the other one had been
     assert found["cases"] == ["none-0001"] and found["cpu_s"]["none-0001"] > 0.05
+    assert say("run", str(folder))["cases"] == []
     scored = say("score", str(folder), "--jobs", "2")
     assert [m["case"] for m in scored["cases"]] == ["none-0000", "none-0001"]
     row = scored["summary"]["none"]
-    assert row["cases"] == 2 and row["cpu_s_mean"] == found["cpu_s"]["none-0001"]
+    assert row["cases"] == 2
     assert sum(row["verdicts"].values()) == 2
 
 

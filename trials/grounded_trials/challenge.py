@@ -2,7 +2,6 @@
 
     DIR/single-0007/       a workspace: module, parameters, target, trials, but no label
     DIR/manifest.json      for each case the SHA-256 of its label and of each of its trials
-    DIR/times.json         CPU time of the diagnoses [s]
     LABELS/single-0007.json  the label; it is accepted only with the hash in the manifest
 
 Keep the labels on another disk while the cases are diagnosed. Cases are independent jobs
@@ -41,7 +40,7 @@ from grounded_trials.workspace.last_diagnosis import write_diagnosis
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.task_file import write_target
 
-MANIFEST, TIMES = "manifest.json", "times.json"
+MANIFEST = "manifest.json"
 LIMIT = 2**26  # [bytes] of a manifest or a label
 
 
@@ -164,7 +163,7 @@ def diagnose_cases(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> dict[str, float]:
-    """Diagnose every case that has no diagnosis yet; return the known CPU time [s] by case.
+    """Diagnose every case that has no diagnosis yet; return the CPU time [s] by case.
 
     Args:
         folder: the challenge.
@@ -178,11 +177,8 @@ def diagnose_cases(
     """
     names = undiagnosed(folder, again=again)
     where = {"folder": str(folder.resolve()), "without": list(without)}
-    times = read_times(folder)
     found = run_jobs(diagnose_case, [where | {"name": n} for n in names], engine, progress)
-    times |= {str(one["case"]): float(one["cpu_s"]) for one in found}
-    write_atomically(folder / TIMES, json.dumps(times, indent=1, sort_keys=True).encode())
-    return times
+    return {str(one["case"]): float(one["cpu_s"]) for one in found}
 
 
 def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
@@ -216,7 +212,7 @@ def score_cases(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Score every case against an oracle that knows its label; adds the CPU time [s] if known.
+    """Score every case against an oracle that knows its label.
 
     Raises:
         GroundedError: if a case was not diagnosed, or a trial or label was changed.
@@ -224,14 +220,4 @@ def score_cases(
     entries = read_manifest(folder)
     where = {"folder": str(folder.resolve()), "labels": str(labels.resolve())}
     cases = [where | {"name": name, "entry": entry} for name, entry in entries.items()]
-    times = read_times(folder)
-    marks = run_jobs(score_case, cases, engine, progress)
-    return [m | {"cpu_s": times[m["case"]]} if m["case"] in times else m for m in marks]
-
-
-def read_times(folder: Path) -> dict[str, float]:
-    """Read the CPU time [s] by case; empty if the file is missing or can't be read."""
-    try:
-        return dict(json.loads((folder / TIMES).read_text(encoding="utf-8")))
-    except (OSError, ValueError, TypeError):
-        return {}
+    return run_jobs(score_case, cases, engine, progress)

@@ -32,7 +32,6 @@ class Inspected(Result):
     outside: bool = False  # inspected outside any workspace
     ran_nothing: bool = False  # no candidate was proposed yet that it could have run
     odd: tuple[str, ...] = ()  # suspicious entries of the workspace's [log]
-    mapped: bool = False  # the workspace's [log] has all states and inputs already
 
     @property
     def format(self) -> str:
@@ -111,9 +110,6 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
         return Inspected(str(log), report, "", why, outside=not here)
     states, inputs = assigned(report, model.states, model.inputs, model)
     table = mapping_toml(states, inputs, simulated=report.simulated, layout=layout)
-    mapping = workspace.log_mapping
-    odd = tuple(one.sentence for one in misread(model, mapping))
-    known = {*mapping.states, *mapping.inputs} if mapping else set[str]()
-    mapped = {*model.states, *model.inputs} <= known
+    odd = tuple(one.sentence for one in misread(model, workspace.log_mapping))
     ran_nothing = not workspace.candidate_ids()
-    return Inspected(str(log), report, table, ran_nothing=ran_nothing, odd=odd, mapped=mapped)
+    return Inspected(str(log), report, table, ran_nothing=ran_nothing, odd=odd)
