@@ -168,8 +168,8 @@ def held_first(
     trial = Trial(x, u, dt, model.state_names, model.input_names)
     long, brief = (standstill(model, trial, seconds, ranges) for seconds in (STOOD, BEGAN))
     if long is not None and long.needs.any():
-        held = dict(zip(model.input_names, long.inputs.tolist(), strict=True))
-        return _away(model, long) | held
+        held = zip(model.input_names, long.inputs.tolist(), long.needs, strict=True)
+        return _away(model, long) | {name: u for name, u, needed in held if needed}
     if brief is None or brief.needs.any() or has_plane(model):
         return None
     return (long and _away(model, long)) or _away(model, brief)

@@ -46,7 +46,8 @@ class Stand:
         states: their medians in the second half of that time (n,).
         inputs: the same of the inputs (m,): a controller may sag at first.
         steady: changes of the states that count as none (n,).
-        needs: inputs that have to hold it there (m,) bool: constant, or beyond what trembles.
+        needs: inputs that hold it there (m,) bool: constant, or beyond what trembles, and without
+            which the model moves more. A throttle held while the motors are off is none.
         trial: its id.
     """
 
@@ -92,6 +93,14 @@ def standstill(
         return None
     at, held = np.median(x[steps // 2 :], axis=0), np.median(later, axis=0)
     needs = (held != 0) & ((np.ptp(later, axis=0) == 0) | (np.abs(held) > STEADY * sent))
+
+    # By how much the model moves there with all inputs, and without each, in parts of the ranges.
+    u = held * np.append(np.ones((1, model.m)), 1 - np.eye(model.m), axis=0)
+    x = np.tile(at, (len(u), 1))
+    with np.errstate(all="ignore"):
+        moved = model.difference(model.system.step(x, u, model.values, trial.dt), x)
+    moves = np.linalg.norm(moved / np.where(whole > 0, whole, 1.0), axis=1)
+    needs &= moves[1:] > moves[0]
     return Stand(at, held, STEADY * whole, needs, trial.id)
 
 
@@ -273,8 +282,8 @@ def _rest_of(workspace: Folder, stand: Stand) -> dict[str, float]:
     needed = np.abs(np.nan_to_num(a) - np.eye(model.n)).max(axis=0) > DEPENDS
     told = needed & ~rates & (np.abs(at) > stand.steady)
     found = {n: float(f"{at[i]:.4g}") for i, n in enumerate(model.state_names) if told[i]}
-    inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names)}
-    return found | {n: v for n, v in inputs.items() if found and v}
+    inputs = {n: float(f"{held[j]:.4g}") for j, n in enumerate(model.input_names) if stand.needs[j]}
+    return found | (inputs if found else {})
 
 
 NOISY = 0.02  # most utility that the noise of a state may cost at the end, by its weight
