@@ -159,7 +159,8 @@ def test_the_real_car_of_a_laboratory(tmp_path):
     assert by["throttle"].path == "/throttle_1.data"
     both = {"/arduino_data_1.data[3]", "/sensors_and_input_1.data[6]"}
     assert both <= {by["v"].path, *by["v"].others} and not by["v"].sure
-    assert not by["steering"].sure and len(by["steering"].others) == 1
+    assert by["steering"].path == "/steering_1.data"  # in parts of the lock, as the input is
+    assert by["steering"].others == ("/steering_angle_1.data",)
 
 
 @pytest.fixture

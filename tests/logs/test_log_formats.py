@@ -289,3 +289,13 @@ def cart_candidate(tmp_path):
     w = Workspace(make(tmp_path / "w").folder)
     w.export(w.propose().candidate.id, tmp_path / "c0001.npz", form="npz")
     return tmp_path, tmp_path / "c0001.npz"
+
+
+def test_a_table_that_ends_with_a_state_after_its_last_command_is_whole(tmp_path):
+    """As a trial is exported: the last state has no command."""
+    rows = [f"{t:.2f},{x:.6f},{x:.6f}" for t, x in zip(TIME, X, strict=True)]
+    (tmp_path / "run.csv").write_text("\n".join(["t,x,u", *rows[:-1], rows[-1][:-9] + ","]) + "\n")
+    report = inspect_log(tmp_path / "run.csv")
+    assert not report.findings and not any(one.not_finite for one in report.numbers)
+    signals = {"u": SignalSpec("/csv.u", clock="log")}
+    assert len(read_signals(tmp_path / "run.csv", signals)["u"].t) == N - 1

@@ -49,6 +49,26 @@ def test_a_car_without_a_speed_command_is_driven_by_what_its_log_has(tmp_path, n
     assert gain.low < FULL / 2 and gain.high > 2 * FULL
 
 
+def test_a_throttle_held_while_the_motor_is_off_is_no_start(tmp_path):
+    """What [task] start holds is sent after a run, too."""
+    rows = driven()
+    rows[:50, 6] = 0.15
+    log = tmp_path / "drive.csv"
+    np.savetxt(log, rows, "%.5f", ",", header="t,v,x,y,psi,steering,throttle", comments="")
+    begin(tmp_path / "w", log, kind="car")
+    assert not Workspace(tmp_path / "w").task.past.any()
+
+
+@pytest.mark.parametrize(("head", "unit"), [("steering [%]", "1"), ("steering [deg]", "rad")])
+def test_a_steering_without_an_angle_is_a_part_of_the_lock(tmp_path, head, unit):
+    log = tmp_path / "drive.csv"
+    names = f"t,v,x,y,psi,{head},speed_cmd"
+    np.savetxt(log, driven(), "%.5f", ",", header=names, comments="")
+    begin(tmp_path / "w", log, kind="car")
+    model = Workspace(tmp_path / "w").task.model
+    assert model.inputs["steering"] == unit and ("lock" in model.params) == (unit == "1")
+
+
 def test_no_plan_is_made_for_an_input_that_log_does_not_map(tmp_path):
     """A node sent a speed of 1.6 m/s as the duty of its motor."""
     w = tmp_path / "w"

@@ -131,11 +131,6 @@ FILE: dict[str, Entry] = {
         "see [log.span][[every? and the unit of the times]]",
     ),
     # what is odd in a log
-    "staircase": warn(
-        "{about} {about:changes/change} at {changes:g} Hz, but rows come at {rows:g} Hz: samples "
-        "are held and {late:g} s late on average",
-        "leave cells empty in rows that repeat a value",
-    ),
     "outlier": warn(
         "'{about}' is {value:.4g} at {at:.3f} s, far outside all its other samples, {low:.4g} to "
         "{high:.4g}",
@@ -149,9 +144,6 @@ FILE: dict[str, Entry] = {
         "{about}:[[ only {messages:message}]][[ only its first {first:number} are listed]][[ "
         "{lost:value} not finite]][[ {bridged:value} bridged]][[ {stamps:stamp} out of order, "
         "repeated or 0]][[ held from a single sample{single:1=}]][[, the largest gap is {gap}]]",
-    ),
-    "opposite": warn(
-        "{about} show the same motion with OPPOSITE SIGN, correlation {correlation:.3f}"
     ),
     # what is lost
     "cut": warn(

@@ -15,7 +15,7 @@ from grounded_trials.formats.messages import decoder_of
 from grounded_trials.formats.path_walk import number_paths
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import mapping_toml
-from grounded_trials.logs.inspection.inspect_log import inspect_log, opposite_signals
+from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec
 from shared_data import data, needs_data
@@ -106,22 +106,6 @@ def test_number_paths() -> None:
     for _ in range(50):
         deep = {"d": deep, "v": 1}
     assert len(number_paths(deep)) < 20
-
-
-def test_signals_of_opposite_sign() -> None:
-    t = np.arange(0, 10, 0.01)
-    ns = (t * 1e9).astype(np.int64)
-    slow = ns[::9]
-    samples = {
-        "/a.q.@rpy.pitch": (ns, np.sin(t)),
-        "/b.q.@rpy.pitch": (slow, -np.sin(t[::9])),
-        "/b.q.@rpy.roll": (slow, np.sin(t[::9])),
-        "/c.q.@rpy.pitch": (slow, np.cos(t[::9])),
-        "/d.q.@rpy.pitch": (slow, np.full(len(slow), np.nan)),
-    }
-    (opposite,) = opposite_signals(samples)
-    assert opposite.about == ("/a.q.@rpy.pitch", "/b.q.@rpy.pitch")
-    assert opposite.facts["correlation"] < -0.999
 
 
 @needs_data

@@ -79,8 +79,10 @@ def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
         raise BadPath("path", expected="one value", found=str(len(ends)))
     values = _apply(ends, path.function, part.is_table)
     if part.is_table:
-        every = np.arange(len(part.log_times))
-        return Found(every, values, part.log_times) if ends else Found(every[:0], values, None)
+        # A table of a run may end with a state after its last command.
+        count = len(values) - bool(len(values) > 1 and not np.isfinite(values[-1]))
+        times = part.log_times[:count] if ends else None
+        return Found(np.arange(count), values[:count], times)
     found, messages = np.array(at, dtype=np.int64), np.array(rows, dtype=np.int64)
     if not names:
         return Found(messages[found], values, None)

@@ -5,9 +5,7 @@ wrong numbers can't be located; the message indexes after it show what it contai
 off by the end of the file, the messages before the cut are kept. Schemas and channels are taken
 from anywhere in the file, including the summary.
 
-Nothing marks the start of a record, but each states where the next one starts. After damage, the
-next place with an intact chain is sought: a chunk whose inner lengths are consistent, the first of
-several records in a row, or the last ones of the file.
+Each record states where the next one starts: behind one whose length is damaged nothing is saved.
 """
 
 from __future__ import annotations
@@ -16,7 +14,6 @@ import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from struct import Struct
 
@@ -54,7 +51,6 @@ from grounded_trials.formats.mcap_records import (
 )
 from grounded_trials.formats.mcap_walk import Data, again, chunk_records, mapped, message_positions
 from grounded_trials.formats.mcap_writer import McapWriter
-from grounded_trials.formats.messages import Ints
 from grounded_trials.logs.log_files import empty, open_log
 from grounded_trials.store.store import sync_folder
 from grounded_trials.within import within
@@ -192,11 +188,10 @@ def _opened(copy: McapWriter, channel: Channel, schema: Schema | None) -> int:
 
 
 _SPAN = Struct("<QQ")  # a chunk's first and last time
-CHAIN = 3  # consecutive plausible records after which a place is accepted
 
 
 class Salvage:
-    """One pass over a damaged file.
+    """One pass over a damaged file, up to the first record whose head can't be one.
 
     Attributes:
         losses: what was lost.
@@ -209,7 +204,7 @@ class Salvage:
         self.losses: list[Finding] = []
         self.lost_messages: Counter[int] = Counter()
         self.dropped: list[tuple[int, int]] = []
-        self._crc = 0
+        self._crc = zlib.crc32(MAGIC)
         self._outside = 0  # messages outside checked chunks, covered only by the data checksum
         self._tables = 0  # metadata and attachments covered only by it
         self._ended = False  # the data section has ended; only the index follows
@@ -218,34 +213,15 @@ class Salvage:
 
     def records(self) -> Iterator[Record]:
         """Yield what can be saved, in file order."""
-        pos: int | None = len(MAGIC)
-        if self.data[:8] == MAGIC:
-            self._crc = zlib.crc32(MAGIC)
-        else:
+        if self.data[:8] != MAGIC:
             self.losses.append(found("file.lost", part="its beginning"))
-            pos = self._next_chain(0)
-        dropped_chunk, before = False, 0  # the record before, 0 after a gap
-        while pos is not None and pos < self.size - len(MAGIC):
-            end = self._end_of(pos)
-
-            # Damage: its place is passed over, or the file is cut off there.
-            if end is None:
-                after = None if self._is_cut_chunk(pos) else self._next_chain(pos + 1)
-                if after is None:
-                    yield from self._cut(self.data[pos:])
-                    return
-                self.losses.append(found("file.lost", bytes=after - pos, byte=pos))
-                pos, before = after, 0
-                continue
-
-            # A record, or a run of messages outside chunks.
-            opcode, stop = self.data[pos], end
+        pos, before, dropped_chunk = len(MAGIC), 0, False  # the kind of the record before
+        while (stop := self._end_of(pos)) is not None:
+            opcode, end = self.data[pos], stop
             if opcode == MESSAGE and (self._ended or before in (CHUNK, MESSAGE_INDEX)):
                 self.losses.append(found("file.lost", part=record_name(MESSAGE), byte=pos))
-            elif opcode == MESSAGE:
-                while stop < self.size and self.data[stop] == MESSAGE:
-                    if (further := self._end_of(stop)) is None:
-                        break
+            elif opcode == MESSAGE:  # a run of messages outside chunks
+                while (further := self._end_of(stop)) and self.data[stop] == MESSAGE:
                     stop = further
                 run = self.data[pos:stop]
                 positions = message_positions(run, 0, len(run))[0]
@@ -266,10 +242,8 @@ class Salvage:
                 dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
                 before = opcode
             self._crc, pos = zlib.crc32(self.data[pos:stop], self._crc), stop
-        self._ends_early()
-
-    def _ends_early(self) -> None:
-        self.losses.append(found("file.cut", byte=self.size, index=int(self._ended)))
+        yield from self._cut(self.data[pos:])
+        self.losses.append(found("file.cut", byte=pos, index=int(self._ended)))
 
     def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
         try:
@@ -321,13 +295,6 @@ class Salvage:
             channel, size = Struct("<HI").unpack_from(content)
             self.lost_messages[channel] += size // 16
 
-    def _is_cut_chunk(self, pos: int) -> bool:
-        """Check whether an intact chunk begins here that is cut off by the end of the file."""
-        start = self.data[pos : pos + 9 + 64]
-        if len(start) < 49 or start[0] != CHUNK:
-            return False
-        return is_chunk(start[9:], int.from_bytes(start[1:9], "little"))
-
     def _end_of(self, pos: int) -> int | None:
         """Return where the record there ends; None if there can't be one."""
         if self.size - pos < 9:
@@ -335,38 +302,7 @@ class Salvage:
         opcode, length = RECORD_HEAD.unpack_from(self.data, pos)
         end = pos + 9 + int(length)
         short = opcode == MESSAGE and length < MESSAGE_HEADER
-        if opcode == 0 or opcode > DATA_END or end > self.size or short:
-            return None
-        if opcode == CHUNK and not is_chunk(self.data[pos + 9 : pos + 73], int(length)):
-            return None
-        return end
-
-    @cached_property
-    def _places(self) -> Ints:
-        """Where a record may begin: an opcode there, and a length below 2^32."""
-        octets = np.frombuffer(self.data, dtype=np.uint8)
-        count = max(len(octets) - 8, 0)
-        maybe = (octets[:count] > 0) & (octets[:count] <= DATA_END)
-        for i in range(5, 9):
-            maybe &= octets[i : count + i] == 0
-        return np.flatnonzero(maybe)
-
-    def _next_chain(self, start: int) -> int | None:
-        """Return the first offset from `start` on with a chain of records, None for none."""
-        after = self._places[np.searchsorted(self._places, start) :]
-        return next((int(at) for at in after if self._is_chain(int(at))), None)
-
-    def _is_chain(self, pos: int) -> bool:
-        if self.data[pos] == CHUNK:
-            return self._end_of(pos) is not None
-        for _ in range(CHAIN):
-            end = self._end_of(pos)
-            if end is None:
-                return False
-            if end == self.size - len(MAGIC) and self.data[end:] == MAGIC:
-                return True
-            pos = end
-        return True
+        return None if opcode == 0 or opcode > DATA_END or end > self.size or short else end
 
     def _cut(self, rest: bytes) -> Iterator[Record]:
         """Yield the intact parts of the record in which the file ends."""
@@ -380,14 +316,3 @@ class Salvage:
                     yield from self._sound(record)
         except BadRecord:
             pass
-        self._ends_early()
-
-
-def is_chunk(start: bytes, length: int) -> bool:
-    """Check whether a chunk of this length may start so: its inner lengths are consistent."""
-    if len(start) < 40:
-        return False
-    name = int.from_bytes(start[28:32], "little")
-    if name > 8 or start[32 : 32 + name] not in (b"", b"zstd", b"lz4"):
-        return False
-    return int.from_bytes(start[32 + name : 40 + name], "little") == length - 40 - name

@@ -30,14 +30,13 @@ from grounded_trials.logs.command_steps import (
     rows_apart,
     stands_still,
 )
-from grounded_trials.logs.samples import REGULAR, Samples, check_overlap, tidy
+from grounded_trials.logs.samples import REGULAR, How, Samples, check_overlap, tidy
 from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
     findings_of,
     outliers,
     report_of,
-    staircases,
     vanished,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
@@ -160,85 +159,105 @@ def to_grid(
     names = [*states, *inputs]
     clocks = check_clocks({n: series[n] for n in (*names, *span.signals())})
     samples = {n: tidy(n, series[n], unwrap=n in angles) for n in names}
-    check_overlap([samples[n] for n in states], [samples[n] for n in inputs])
-    how: dict[str, str] = {
-        n: samples[n].spec.resample or ("linear" if n in states else "hold") for n in names
-    }
-    for name in names:
-        if how[name] == "linear":
-            samples[name].check_linear(dt)
-    known, until = _extent(samples, states, inputs, dt)
+    measured, sent = ([samples[n] for n in some] for some in (states, inputs))
+    check_overlap(measured, sent)
+    tracked = [one for one in measured if one.spec.resample != "hold"]
+    for one in (*tracked, *(one for one in sent if one.spec.resample == "linear")):
+        one.check_linear(dt)
+
+    # Where the trial begins and ends.
+    known, until = _extent(measured, sent, dt)
     origin = min(s.first_stamp if s.spec.before is None else _begun(s) for s in samples.values())
-    start, late = _start(span, series, samples, inputs, known, origin)
-    whole = dict(samples)
-    for name, value in zip(inputs, [] if past is None else past, strict=False):
-        if samples[name].t[0] > start + dt * 0.5e9:  # nothing was sent in the first step
-            whole[name] = samples[name].held_from(start - round(dt * 1e9), float(value))
-    sent = [whole[name] for name in inputs]
-    tracked = [samples[name] for name in states if how[name] == "linear"]
-    still = rest is not None and stands_still(tracked, rates, start)
-    unknown = rest is not None and not still and in_motion(sent, start, rest)
-    moved, in_steps = (0, True) if rest is None else first_step(sent, start, dt, unknown)
-    start += moved
+    start, late = _start(span, series, measured, sent, known, origin)
+    begun = _Commands.at(start, dt, sent, tracked, rates, rest, past)
+    start += begun.moved
     stop = min(until, _end(span, series, start, origin, until))
     count = _steps(start, stop, dt, steps, origin, stamped_otherwise(samples.values(), dt))
+
+    # The values: of states at the grid, of inputs in the middle of its steps.
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
-    times = {name: grid if name in states else middle for name in names}
-    if not in_steps:
-        how |= {n: "mean" for n in inputs if samples[n].spec.resample is None}
-    sampled: dict[str, Callable[[Samples, Ints, float, int], Floats]] = {
-        "linear": Samples.linear,
-        "hold": Samples.hold,
-        "mean": Samples.mean,
+    at = dict.fromkeys(states, grid) | dict.fromkeys(inputs, middle)
+    whole = dict(zip(names, (*measured, *begun.sent), strict=True))
+    usual: dict[str, How] = {
+        **dict.fromkeys(states, "linear"),
+        **dict.fromkeys(inputs, begun.usual),
     }
-    columns = [sampled[how[name]](whole[name], at, dt, start) for name, at in times.items()]
+    values = {n: whole[n].sampled(whole[n].spec.resample or usual[n], at[n], dt, start) for n in at}
 
     def told() -> tuple[tuple[SignalReport, ...], tuple[Finding, ...]]:
-        reports = tuple(
-            report_of(samples[name], series[name], column, at, start)
-            for (name, at), column in zip(times.items(), columns, strict=True)
-        )
-        stairs = staircases(tracked, start, int(grid[-1]), dt)
+        own = ((samples[n], series[n], values[n], at[n]) for n in names)
+        reports = tuple(report_of(*one, start) for one in own)
         odd = outliers(tracked, start, int(grid[-1]))
         cut = stop == until and (steps is None or count < steps) and span.end is None
-        gone = vanished([samples[n] for n in states], int(grid[-1] + dt * 1e9)) if cut else []
-        return reports, (*findings_of(reports, late), *clocks, *stairs, *odd, *gone)
+        gone = vanished(measured, int(grid[-1] + dt * 1e9)) if cut else []
+        return reports, (*findings_of(reports, late), *clocks, *odd, *gone)
 
-    held, assumed = _sent_before(sent, start, dt, rest if still else None)
-    if assumed and rest is not None and in_motion(sent, start, rest):
-        held = np.where(np.isfinite(held), held, [s.y[0] for s in sent])
+    held, assumed = begun.held_before(start, dt, rest)
     return Gridded(
-        states=np.column_stack(columns[: len(states)]),
-        inputs=np.column_stack(columns[len(states) :]),
-        start_inputs=held if np.isfinite(held).all() else None,
+        states=np.column_stack([values[name] for name in states]),
+        inputs=np.column_stack([values[name] for name in inputs]),
+        start_inputs=held,
         assumed=assumed,
         start_states=_start_states(tracked, rates, start),
         start_ns=start,
         origin_ns=origin,
         late_s=late,
-        moved_s=moved * 1e-9,
-        row_s=rows_apart(sent, [samples[name] for name in states]),
+        moved_s=begun.moved * 1e-9,
+        row_s=rows_apart(begun.sent, measured),
         early=lambda: max((begins_early(one, grid) for one in tracked), default=0.0),
-        last_ns=min(int(samples[name].t[-1]) for name in states),
+        last_ns=min(int(one.t[-1]) for one in measured),
         told=told,
     )
 
 
-def _sent_before(
-    sent: Sequence[Samples], start: int, dt: float, rest: Floats | None
-) -> tuple[Floats, bool]:
-    """Return the inputs before a run (m,), NaN where the log tells none, and whether one is.
+@dataclass(frozen=True)
+class _Commands:
+    """The inputs from where every signal is known on."""
 
-    Args:
-        sent: the inputs.
-        start: of the run [ns].
-        dt: control interval [s].
-        rest: (m,) inputs at rest, if it stood still before; None otherwise.
-    """
-    held = np.array([s.before(start - round(dt * 0.5e9)) for s in sent])
-    held = held if rest is None else np.where(np.isfinite(held), held, rest)
-    return held, not np.isfinite(held).all()
+    sent: Sequence[Samples]
+    moved: int  # shift of the start to where they change [ns]
+    usual: How  # how they are sampled: changes in no steps have a mean
+    still: bool  # whether the robot stood still until then
+
+    @classmethod
+    def at(
+        cls,
+        start: int,
+        dt: float,
+        sent: Sequence[Samples],
+        tracked: Sequence[Samples],
+        rates: Sequence[str],
+        rest: Floats | None,
+        past: Floats | None,
+    ) -> _Commands:
+        """Find the first step at or after a start [ns]; for the others see `to_grid`."""
+        before = start - round(dt * 1e9)
+        if past is not None:  # for an input of which nothing was sent in the first step
+            waits = (one.t[0] > start + dt * 0.5e9 for one in sent)
+            three = zip(sent, past.tolist(), waits, strict=True)
+            sent = [one.held_from(before, u) if wait else one for one, u, wait in three]
+        if rest is None:
+            return cls(sent, 0, "hold", False)
+        still = stands_still(tracked, rates, start)
+        moved, in_steps = first_step(sent, start, dt, not still and in_motion(sent, start, rest))
+        return cls(sent, moved, "hold" if in_steps else "mean", still)
+
+    def held_before(self, start: int, dt: float, rest: Floats | None) -> tuple[Floats | None, bool]:
+        """Return the inputs before a run (m,), None if unknown, and if the log lacks one of them.
+
+        Args:
+            start: of the run [ns].
+            dt: control interval [s].
+            rest: (m,) inputs at rest.
+        """
+        held = np.array([one.before(start - round(dt * 0.5e9)) for one in self.sent])
+        if self.still and rest is not None:
+            held = np.where(np.isfinite(held), held, rest)
+        assumed = not np.isfinite(held).all()
+        if assumed and rest is not None and in_motion(self.sent, start, rest):
+            held = np.where(np.isfinite(held), held, [one.y[0] for one in self.sent])
+        return (held if np.isfinite(held).all() else None), assumed
 
 
 def begins_early(samples: Samples, grid: Ints) -> float:
@@ -267,19 +286,15 @@ def _start_states(states: Sequence[Samples], rates: Sequence[str], start: int) -
     return {name: one.mean if still else one.line for name, one in leads.items() if one}
 
 
-def _extent(
-    samples: Mapping[str, Samples], states: Sequence[str], inputs: Sequence[str], dt: float
-) -> tuple[int, int]:
+def _extent(measured: Sequence[Samples], sent: Sequence[Samples], dt: float) -> tuple[int, int]:
     """Return from when every state is known, and until when every signal is known [ns]."""
     first, last = [], []
-    for name in states:
-        s = samples[name]
+    for s in measured:
         held = s.spec.resample == "hold"
         slack = 0 if held else int(s.slack(dt) * 1e9)  # rounded down: beyond it values are refused
         first.append(int(s.t[0]) - slack)
         last.append(int(s.t[-1]) + (round(s.max_gap(dt) * 1e9) if held else slack))
-    for name in inputs:
-        s = samples[name]
+    for s in sent:
         if s.spec.max_age_s is not None:
             last.append(int(s.t[-1]) + round(s.spec.max_age_s * 1e9))
         elif len(s.t) > REGULAR:
@@ -295,8 +310,8 @@ def _begun(samples: Samples) -> int:
 def _start(
     span: Span,
     series: Mapping[str, Series],
-    samples: Mapping[str, Samples],
-    inputs: Sequence[str],
+    measured: Sequence[Samples],
+    sent: Sequence[Samples],
     known: int,
     origin: int,
 ) -> tuple[int, float]:
@@ -307,12 +322,12 @@ def _start(
     if isinstance(span.start, Crossing):
         start = _crossing(span.start, series[START], "start", None)
     elif isinstance(span.start, str):
-        start = max(_begun(samples[name]) for name in inputs)
+        start = max(map(_begun, sent))
     else:
         start = _time(span.start, origin)
     if start >= known:
         return start, 0.0
-    first = max(int(samples[name].t[0]) for name in samples if name not in inputs)
+    first = max(int(one.t[0]) for one in measured)
     return first, (first - start) * 1e-9
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -34,6 +34,8 @@ SPARSE = 50.0  # steps between two samples above which the log's time seems to b
 MOSTLY, WHOLE = (0.01, 0.99), 1.02  # the values of a wrapped angle are so nearly within a turn
 DISORDERED = 0.01  # least share of stamps out of order that counts: sorting mends them
 REGULAR = 10  # an input with more samples is sent continuously; it ends the trial with its last
+
+How = Literal["linear", "hold", "mean"]  # what gives the value between samples
 
 
 @dataclass(frozen=True)
@@ -91,6 +93,11 @@ class Samples:
         if self.interval > SPARSE * dt and self.spec.max_age_s is None:
             facts: dict[str, Any] = {"path": self.spec.path, "every": self.interval, "dt": dt}
             raise GroundedError(found("file.gap", self.name, **facts))
+
+    def sampled(self, how: How, at: Ints, dt: float, origin: int) -> Floats:
+        """Return values (M,) at times: by `linear`, `hold` or `mean`, which see."""
+        by = {"linear": self.linear, "hold": self.hold, "mean": self.mean}
+        return by[how](at, dt, origin)
 
     def linear(self, at: Ints, dt: float, origin: int) -> Floats:
         """Interpolate values at times [ns]; up to half an interval beyond the ends is allowed.

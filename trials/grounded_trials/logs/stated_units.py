@@ -68,9 +68,9 @@ def unit_in_name(path: str) -> str:
     return ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
 
 
-def command_unit(name: str, path: str, units: Mapping[str, str]) -> str:
-    """Return the unit of a command: stated by the log, in its name, else "1", or V of a voltage."""
-    return units.get(path) or unit_in_name(path) or ("V" if "volt" in name.lower() else "1")
+def command_unit(name: str, path: str, stated: Stated) -> str:
+    """Return the unit of a command: the one that the log states, else "1", or V of a voltage."""
+    return stated.unit(path) or ("V" if "volt" in name.lower() else "1")
 
 
 def without_unit(path: str) -> str:

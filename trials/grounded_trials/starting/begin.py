@@ -30,7 +30,7 @@ from grounded_trials.logs.inspection.guess import Guess, mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.joint_names import joint_names
 from grounded_trials.logs.inspection.names import PARTS
-from grounded_trials.logs.log_files import column_units, kind_of, log_files
+from grounded_trials.logs.log_files import kind_of, log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.starting.examples import fresh_folder
@@ -177,7 +177,7 @@ def begin(
     with fresh_folder(folder, files):
         # What the log has, and the model: the user's, or a skeleton of the kind of robot.
         logs, report, notes = _usable(log, layout)
-        clues = Clues(report, joint_names(report), column_units(logs[0]))
+        clues = Clues(report, joint_names(report))
         drawn = _Draft(folder, clues, own, inputs)
         drawn.begin("generic" if inputs else kind or "")
 

@@ -23,11 +23,10 @@ from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC, NAMES_BY_UNIT, PARTS
 from grounded_trials.logs.inspection.relations import Signals
-from grounded_trials.logs.stated_units import Stated, bare_command, command_unit, unit_in_name
+from grounded_trials.logs.stated_units import Stated, bare_command, command_unit
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
 
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
-Units = Mapping[str, str]  # unit of a number by its path
 HELD = 0.3  # share of samples equal to the previous one, above which a number is a command
 QUIET = 10.0  # range of a number of noise alone, in standard deviations of that, at most
 MOST_STATES, MOST_INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
@@ -59,10 +58,6 @@ LIFTED = "thrust(?!er)|attitude_setpoint|actuator_outputs"
 SPEED = re.compile(r"speed|veloc|(^|[/._])vel([/._]|$)|cmd_vel|linear|geschw|vitesse")
 MOTOR = re.compile("throttle|duty|pwm|motor|volt|current|power|effort|torque|(^|[/._])(gas|esc)")
 STEERS = re.compile("steer|servo|lenk")
-DRIVEN = 0.25  # of the largest command: smaller ones say little, friction stops the robot
-STEADY = 0.05  # of the largest speed: by less it changes within `WITHIN` at a steady speed
-WITHIN = 0.5  # [s]
-STEADY_SAMPLES = 20  # samples at a steady speed; of fewer the largest ratio is taken
 GAIN_RANGE = 5.0  # the gain's bounds are that many times smaller and larger
 
 
@@ -117,8 +112,8 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     Raises:
         GroundedError: for an input that the log does not have.
     """
-    log, found, known = clues.log, clues.found, clues.units
-    unit = {n: known.get(f.path) or unit_in_name(f.path) or "1" for n, f in found.items()}
+    log, found = clues.log, clues.found
+    unit = {n: clues.stated.unit(f.path) or "1" for n, f in found.items()}
     for name in (one for one in inputs if one not in found):
         if any(_word(one.path) == name for one in log.numbers):
             raise refused("start.still", name)
@@ -221,11 +216,10 @@ class Clues:
     Args:
         log: an inspected log.
         joints: names of its joints by topic, see `joint_names`.
-        units: units by path, where the log states them.
     """
 
-    def __init__(self, log: LogReport, joints: Joints, units: Units | None = None) -> None:
-        self.log, self.joints, self.units = log, joints, units or {}
+    def __init__(self, log: LogReport, joints: Joints) -> None:
+        self.log, self.joints, self.stated = log, joints, Stated.by(log.files)
         self.found = moving(log)
         self.sent = {  # the paths of the numbers that are named like commands
             name: one.path
@@ -342,9 +336,9 @@ def skeleton(kind: str, clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
         return _drone(clues)
     plain = fixed(kind)
     if kind == "car" and not clues.ackermann:
-        return _car(plain, clues)
+        return _car(clues)
     if kind == "rover":
-        return pushed(plain, clues.sent, clues.units)
+        return pushed(plain, clues.sent, clues.stated)
     if kind in ("differential", "boat"):
         sides = zip(plain.inputs, clues.sides, strict=False)
         return driven_by(plain, {old: (name, "1") for old, name in sides})
@@ -364,26 +358,25 @@ def _drone(clues: Clues) -> Skeleton:
     return drone(low, high, command)
 
 
-def _car(plain: Skeleton, clues: Clues) -> Skeleton:
-    """Return the car skeleton: driven by the log's own command, steered in rad or unitless."""
+def _car(clues: Clues) -> Skeleton:
+    """Return the car skeleton, driven by the log's own command, steered by an angle or a lock."""
     steered = (one.path for one in clues.log.numbers if "steer" in _word(one.path).lower())
-    said = {unit_in_name(path) for path in steered} - {""}
+    said = {clues.stated.unit(path) for path in steered} - {""}
     angle, part = (any(factor_between(u, of) is not None for u in said) for of in ("rad", "1"))
     throttle = clues.topic("throttle", fields=True)
-    unit = "rad" if angle or not (throttle or part) else "1"
-    plain = driven_by(plain, {"steering": ("steering", unit)})
+    plain = fixed("car" if angle or not (throttle or part) else "car_lock")
     if throttle:
         return pushed_by(plain, "throttle", "1")
-    return pushed(plain, clues.sent, clues.units)
+    return pushed(plain, clues.sent, clues.stated)
 
 
-def pushed(plain: Skeleton, sent: Mapping[str, str], units: Mapping[str, str]) -> Skeleton:
+def pushed(plain: Skeleton, sent: Mapping[str, str], stated: Stated) -> Skeleton:
     """Return a skeleton driven by the log's only motor command, if that has no speed command.
 
     Args:
         plain: a skeleton with the input `speed`.
         sent: paths of the log's commands, by their names.
-        units: units by path, where the log states them.
+        stated: the units that the log states.
     """
     if any(SPEED.search(path.lower()) for path in sent.values()):
         return plain
@@ -396,7 +389,7 @@ def pushed(plain: Skeleton, sent: Mapping[str, str], units: Mapping[str, str]) -
     if len(motors) != 1:
         return plain
     ((name, path),) = motors.items()
-    return pushed_by(plain, name, command_unit(name, path, units))
+    return pushed_by(plain, name, command_unit(name, path, stated))
 
 
 def pushed_by(plain: Skeleton, command: str, unit: str) -> Skeleton:
@@ -430,19 +423,8 @@ def _v(plain: Skeleton) -> str:
 
 
 def _gain(v: Guess, u: Guess, log: LogReport) -> float:
-    """Return the median of v / u at steady speeds, else the largest ratio; 0 if unknown."""
+    """Return the speed per unit of command, by least squares; 0 if unknown."""
     gridded = Signals(log, (), Stated.by(log.files)).grid((v.path, u.path))
-    if gridded is None:
-        return 0.0
-    step, (speed, command) = gridded
-    speed, command = v.scale * speed, u.scale * command
-    most = float(np.abs(command).max())
-    if not most > 0:
-        return 0.0
-    wide = max(round(WITHIN / step), 1)
-    changed = np.full(len(speed), np.inf)
-    changed[wide:] = np.abs(speed[wide:] - speed[:-wide])
-    steady = (changed < STEADY * np.abs(speed).max()) & (np.abs(command) > DRIVEN * most)
-    if steady.sum() >= STEADY_SAMPLES:
-        return float(np.median(speed[steady] / command[steady]))
-    return float(np.abs(speed).max() / most)
+    speed, command = (np.zeros(1), np.zeros(1)) if gridded is None else gridded[1]
+    command = u.scale * command
+    return float(v.scale * speed @ command) / max(float(command @ command), 1e-12)

@@ -1,18 +1,14 @@
 """Summarise an unknown log: topics, types, rates, and every number with its range.
 
 The files are read once; for topics with very many messages, ranges come from every k-th message.
-Signals of one kind that show the same motion with opposite signs, such as the pitch of a motion
-capture and of the on-board estimate, are told: their conventions differ, they must not be mixed.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations
 from pathlib import Path
 
 import numpy as np
@@ -53,11 +49,8 @@ DECODED = 20_000  # decoded messages of a topic beyond which messages are skippe
 GAP = 10.0  # intervals; longer gaps are reported
 SIMULATED_S = 1.0  # [s] header stamps further from the log's clock are simulation time
 SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
-SAME, FEWEST_SAMPLES = 0.95, 30  # correlation of two signals of one motion; fewest samples
 REPEATS = 0.1  # share of samples like the one before, from which a sensor may come in steps
 STEP = 1 / 3  # of a sensor's step: its standard deviation, a little more than 1 / sqrt(12)
-
-KIND = re.compile(r"\.(@rpy\.\w+|(?:position|translation|linear|angular)\.[xyz])$")
 
 
 @dataclass(frozen=True)
@@ -101,7 +94,6 @@ class LogReport:
     duration_s: float
     messages: int
     topics: tuple[TopicReport, ...]
-    opposite: tuple[Finding, ...]  # signals with one motion, but for its sign
     damage: Finding | None = None  # where reading it ended early, and why
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
     joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names that topics give
@@ -166,7 +158,7 @@ def _findings(log: LogReport) -> tuple[Finding, ...]:
             odd.append(found("file.odd_values", name, first=FIELD_LIMIT))
         if bad:
             odd.append(found("file.odd_values", bad[0], lost="some"))
-    return *odd, *log.opposite
+    return tuple(odd)
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT_SAYS) -> LogReport:
@@ -242,7 +234,6 @@ class _Look:
             duration_s=(end - start) * 1e-9,
             messages=sum(topic.count for topic in self.topics.values()),
             topics=tuple(topic.report(start) for topic in self.topics.values()),
-            opposite=tuple(opposite_signals(self._samples())),
             damage=self.damage,
             meta=self.meta if len(files) == 1 else {},
             joints={
@@ -251,11 +242,6 @@ class _Look:
                 if len(topic.joints) == 1
             },
         )
-
-    def _samples(self) -> dict[str, tuple[Ints, Floats]]:
-        kept = ((path, r.samples) for t in self.topics.values() for path, r in t.ranges.items())
-        joined = {path: map(np.concatenate, zip(*some, strict=True)) for path, some in kept if some}
-        return {path: (t, y) for path, (t, y) in joined.items()}
 
 
 @dataclass
@@ -267,13 +253,10 @@ class _Range:
     high: float = -np.inf
     count: int = 0
     not_finite: int = 0
-    samples: list[tuple[Ints, Floats]] = field(default_factory=list)  # if it may have a twin
     noises: list[float] = field(default_factory=list)
     repeated: int = 0
 
-    def add(self, values: Floats, log_times: Ints) -> None:
-        if KIND.search(self.path.text):
-            self.samples.append((log_times, values))
+    def add(self, values: Floats) -> None:
         finite = values[np.isfinite(values)]
         self.count += len(values)
         self.not_finite += len(values) - len(finite)
@@ -329,7 +312,7 @@ class _Topic:
                 values = evaluate(part, one.path, stamps=i == 0)
             except BadPath:  # of another kind in another JSON message
                 continue
-            one.add(values.values, part.log_times[values.rows])
+            one.add(values.values)
             if values.stamps is not None and len(values.stamps):
                 self.skews.append(values.stamps - part.log_times[values.rows])
 
@@ -402,29 +385,3 @@ def _noise(values: Floats) -> float:
     from grounded.accounts.signals import quantum
 
     return max(noise, STEP * quantum([values]))
-
-
-def opposite_signals(samples: Mapping[str, tuple[Ints, Floats]]) -> Iterator[Finding]:
-    """Yield the pairs of signals of one kind that show the same motion with opposite signs.
-
-    Args:
-        samples: stamps [ns] and values by message path.
-    """
-    clean: dict[str, tuple[Floats, Floats]] = {}
-    for path, (t, y) in samples.items():
-        finite = np.isfinite(y)
-        seconds, first = np.unique(1e-9 * t[finite], return_index=True)
-        clean[path] = seconds, y[finite][first]
-
-    # The slower signal is compared with the other one at its stamps.
-    kinds = {path: m[1] for path in clean if (m := KIND.search(path))}
-    for one, other in combinations(kinds, 2):
-        (ta, ya), (tb, yb) = sorted((clean[one], clean[other]), key=lambda s: len(s[0]))
-        if kinds[one] != kinds[other] or len(ta) < FEWEST_SAMPLES:
-            continue
-        inside = (ta >= tb[0]) & (ta <= tb[-1])
-        a, b = ya[inside], np.interp(ta[inside], tb, yb)
-        if len(a) >= FEWEST_SAMPLES and min(a.std(), b.std()) > 1e-3 * max(a.std(), b.std()):
-            correlation = float(np.corrcoef(a, b)[0, 1])
-            if correlation <= -SAME:
-                yield found("file.opposite", one, other, correlation=correlation)
