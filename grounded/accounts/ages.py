@@ -47,7 +47,6 @@ OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
 CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
-UNEXPLAINED = 0.2  # of the velocity's size: a larger remainder comes from another sensor
 STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
 UNSURE = 0.25  # of a delay: a larger uncertainty, or remainder, of two positions shows none
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
@@ -330,7 +329,7 @@ def _weighed(
     left = float(np.sqrt(rest @ rest / count))
     # the velocity must carry the position's noise as its weights would
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
-    explained = left < min(UNEXPLAINED * float(np.sqrt(w @ w / count)), CARRIED * passed)
+    explained = left < CARRIED * passed
     gain = float(weights.sum())
     if rank < length or not explained or abs(gain - 1) > OFF:
         return None

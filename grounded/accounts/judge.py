@@ -28,7 +28,7 @@ from grounded.accounts.motion import (
     known_states,
     plainly_missed,
 )
-from grounded.accounts.table import Account, Term, Told, accounts, versions
+from grounded.accounts.table import RPM, Account, Term, Told, accounts, versions
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
@@ -41,7 +41,6 @@ JUDGED_S = 0.5  # [s] of predictions
 SNAPPED = np.deg2rad(4)  # a heading that is off by a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
 NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sensor
-GROSS = 20.0  # a gross factor; of a trial that is as much larger than others: it is examined
 
 
 @dataclass(frozen=True)
@@ -285,7 +284,7 @@ def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
     """Check whether all rows together are right in size, where an account names a unit."""
     power = sum(gap.power for gap in after.values())
     ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
-    gross = abs(np.log(abs(account.factor))) > np.log(GROSS)
+    gross = abs(np.log(abs(account.factor))) > np.log(RPM)
     off = abs(np.log(max(ratio, 1e-9)))
     return account.kind != "unit" or bool(off < (OF_GROSS if gross else OF_A_UNIT))
 
@@ -331,7 +330,7 @@ def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
     size = np.array([_spread(t.states[:, list(shown)]) for t in trials])
     apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
-    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(GROSS))[:TRIALS]})
+    return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(RPM))[:TRIALS]})
 
 
 class _Seen:

@@ -576,7 +576,7 @@ def suspicion(
     """
     trial, late = trial.until(task.horizon), latest(task)
     ran = follows(own.policy, trial, late)
-    if ran is None or (ran.alike and ran.error < 1e-5):
+    if ran is None or (ran.alike and ran.error < FINE):
         return Suspicion(ran)
     rivals = [(follows(c.policy, trial, late), c.id) for c in others[-OTHERS:] if c.id != own.id]
     alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]

@@ -28,8 +28,8 @@ WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody ma
 DECISIVE = 8.0  # [nats] of evidence that another candidate ran
 SAME = 0.5  # share of another difference that counts as none
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
-# differences of commands, relative to their size: of rounding, none, hardly any, alike, explained
-DIGITS, EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-5, 1e-3, 0.02, 0.05, 0.1
+# differences of commands, relative to their size: none, hardly any, alike, explained
+EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-3, 0.02, 0.05, 0.1
 LATEST = 3  # steps by which commands may be sent or logged late
 FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
@@ -172,7 +172,7 @@ def as_sent(policy: Policy, trial: Trial) -> bool:
     if (trial.state_names, trial.input_names) != names or trial.finite_steps < STEPS_TO_JUDGE:
         return False
     run = commanded(policy, trial)
-    return bool((np.abs(run.asked - run.sent) < DIGITS * run.size).all())
+    return bool((np.abs(run.asked - run.sent) < FINE * run.size).all())
 
 
 def evidence(own: Array, other: Array) -> float:

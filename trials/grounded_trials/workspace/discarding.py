@@ -19,7 +19,7 @@ from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unknown_trial
-from grounded_trials.workspace.intake.remarks.gone_wrong import COLUMNS
+from grounded_trials.workspace.intake import COLUMNS
 from grounded_trials.workspace.readings import again, read_otherwise
 
 STATUS = NextCommand("status")
@@ -83,7 +83,7 @@ def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.remarks.log_faults import log_faults  # slow to load
+    from grounded_trials.workspace.intake.log_faults import log_faults  # slow to load
 
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)

@@ -99,7 +99,7 @@ def learn_in(
 
 def _odd_before(workspace: Folder) -> bool:
     """Return whether the last run's log had faults too, so that the user has chosen to go on."""
-    from grounded_trials.workspace.intake.remarks.log_faults import log_faults  # slow to load
+    from grounded_trials.workspace.intake.log_faults import log_faults  # slow to load
 
     runs = [trial for trial in workspace.task_trials() if trial.candidate]
     return bool(runs) and bool(log_faults(workspace, runs[-1]))

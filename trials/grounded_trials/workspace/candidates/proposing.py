@@ -387,7 +387,7 @@ def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding | None]:
     if last.stored.digest in workspace.noted.asked:
         yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
         return
-    from grounded_trials.workspace.intake.remarks.gone_wrong import shown_by  # slow
+    from grounded_trials.workspace.intake.gone_wrong import shown_by  # slow
 
     history = standing_in(workspace).history
     tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)

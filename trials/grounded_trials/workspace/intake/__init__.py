@@ -1,12 +1,16 @@
 """Ingest logs of the robot: a log becomes a stored trial of the candidate that it ran.
 
-Read `ingest.py` first: the steps, what is stored, and the result. Each room below stands on those
-after it:
+Read `ingest.py` first: the steps, what is stored, and the result. Each stands on those after it:
 
-recognising/  did it run its candidate? What is refused, and what it is instead
-remarks/      what the user is told about a trial that is stored
-opening/      reading a file, a trial written by grounded or any other log through [log]; where in
-              it the run begins
+recognise   did it run its candidate? One case a log, its stories, the judge's choice, and how each
+            is refused; by `look`: which candidate sent it, late or early starts, and falls
+log_faults  columns of a stored trial that are in other units, negated or exchanged
+gone_wrong  what else the user is told about it before the next plan relies on it; also by `status`
+opening/    reading a file, a trial written by grounded or any other log through [log]; where in it
+            the run begins
 
 How a run's commands may have come about is one table, in `grounded.accounts.returned`.
 """
+
+KINDS = "unit sign compass exchange dead offset axes pace clock"
+COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]

@@ -38,6 +38,8 @@ from grounded_trials.workspace.candidates.search_state import (
 )
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
+from grounded_trials.workspace.intake import COLUMNS
+from grounded_trials.workspace.intake.gone_wrong import shown_by
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
@@ -48,7 +50,6 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     others_differ,
     repeated,
 )
-from grounded_trials.workspace.intake.remarks.gone_wrong import COLUMNS, shown_by
 from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import Situation, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -137,11 +138,11 @@ def ingest_log(
         try:
             read = read_log_file(workspace, path, candidate, data, sent_before)
         except NoneWaits as error:
-            from grounded_trials.workspace.intake.recognising.recognise import best_run_again
+            from grounded_trials.workspace.intake.recognise import best_run_again
 
             read = best_run_again(workspace, path, error)
     if not _as_logged(workspace, read):
-        from grounded_trials.workspace.intake.recognising.recognise import recognised
+        from grounded_trials.workspace.intake.recognise import recognised
 
         read = recognised(workspace, path, read, candidate)
     if read.log and read.log.stored:

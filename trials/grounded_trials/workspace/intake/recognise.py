@@ -42,6 +42,13 @@ from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task
+from grounded_trials.workspace.intake.log_faults import column_faults, not_the_logs
+from grounded_trials.workspace.intake.look import (
+    LOOSE,
+    elsewhere,
+    fall_in,
+    sender_of,
+)
 from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.intake.opening.foreign import (
     cut_log,
@@ -50,13 +57,6 @@ from grounded_trials.workspace.intake.opening.foreign import (
 )
 from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
-from grounded_trials.workspace.intake.recognising.look import (
-    LOOSE,
-    elsewhere,
-    fall_in,
-    sender_of,
-)
-from grounded_trials.workspace.intake.remarks.log_faults import column_faults, not_the_logs
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog

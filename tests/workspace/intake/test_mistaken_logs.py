@@ -14,7 +14,7 @@ from grounded.plant import Plant
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-from grounded_trials.workspace.intake.recognising.recognise import stories_of_log
+from grounded_trials.workspace.intake.recognise import stories_of_log
 from workspaces import make
 
 MODEL = """import numpy as np

@@ -23,7 +23,7 @@ from grounded.share import STEPS
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.remarks.gone_wrong import COLUMNS
+from grounded_trials.workspace.intake import COLUMNS
 from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.readings import paths_of, read_by
 

@@ -17,9 +17,9 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.intake.ingest import ingest_log
+from grounded_trials.workspace.intake.look import sender_of
 from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
 from grounded_trials.workspace.intake.opening.run_start import acted_on
-from grounded_trials.workspace.intake.recognising.look import sender_of
 from recorded import follow
 from workspaces import CONFIG, make
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.accounts.sent import (
     DECISIVE,
+    EXACT,
     EXPLAINED,
     FINE,
     LATEST,
@@ -33,7 +34,6 @@ from grounded_trials.workspace.intake.opening.run_start import ActedOn, Recordin
 
 LOOSE = 0.1  # uncertainty of a start, in steps, above which it is another, or is told
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
-ONE = 3e-3  # rms difference, relative to size, below which two candidates count as equal
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
@@ -90,7 +90,7 @@ def sender_of(
             continue
         T = min(len(mine.asked), len(fit.asked))
         differ = np.sqrt((((mine.asked[:T] - fit.asked[:T]) / mine.size) ** 2).mean())
-        if differ < ONE or (nats := evidence(mine.off, fit.off)) <= best:
+        if differ < EXACT or (nats := evidence(mine.off, fit.off)) <= best:
             continue
         if fit.exact or (not late and alike(one, at) is not None):
             best, name, theirs = nats, one.id, fit

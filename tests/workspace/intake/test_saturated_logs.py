@@ -13,7 +13,7 @@ from grounded import Model, Reward, Task
 from grounded.policy import Policy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening.run_start import recording
-from grounded_trials.workspace.intake.recognising.recognise import stories_of_log
+from grounded_trials.workspace.intake.recognise import stories_of_log
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
 HAND = np.array([38.0, 4.0])

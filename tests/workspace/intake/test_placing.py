@@ -10,9 +10,9 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.discarding import set_aside
+from grounded_trials.workspace.intake import gone_wrong
+from grounded_trials.workspace.intake.gone_wrong import placing
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.remarks import initial_state
-from grounded_trials.workspace.intake.remarks.initial_state import placing
 from workspaces import make
 
 
@@ -35,7 +35,7 @@ def placed(w, tmp_path, ran, off):
 
 def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, monkeypatch):
     ran, *_ = read_trial(run(w))
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: 0.9 * w.task.utility(ran))
+    monkeypatch.setattr(gone_wrong, "_changes", lambda *_: 0.9 * w.task.utility(ran))
     assert of_code(placed(w, tmp_path, ran, 0.15), "run.start_spoils")
     for off in (-0.13, 0.11):
         set_aside(w, "discard", [placed(w, tmp_path, ran, off).trial], "")
@@ -57,10 +57,10 @@ def test_a_run_that_is_better_from_either_start_counts(w, monkeypatch, share, co
     worse, better = (read_trial(file)[0] for file in (worse, run(w)))
     utility = w.task.utility(better)
     assert utility > w.task.utility(worse)
-    monkeypatch.setattr(initial_state, "_changes", lambda *_: share * utility)
+    monkeypatch.setattr(gone_wrong, "_changes", lambda *_: share * utility)
     moved = np.array(better.states)
     moved[0, 0] += 0.01
-    assert initial_state.begun_elsewhere(w, replace(better, states=moved)).code == code
+    assert gone_wrong.begun_elsewhere(w, replace(better, states=moved)).code == code
 
 
 def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, tmp_path):

@@ -9,7 +9,7 @@ from cli import grounded
 from facts import holds
 from grounded import Model, Trial
 from grounded_trials import Workspace
-from grounded_trials.workspace.intake.remarks.log_faults import column_faults
+from grounded_trials.workspace.intake.log_faults import column_faults
 from ros_bags import rover_bag
 
 

@@ -61,7 +61,7 @@ def test_the_lines_of_the_docs_make_one_log_of_two_tables(tmp_path, monkeypatch)
         np.savetxt(f"{name}.csv", rows[:, columns], "%.5f", ",", header=head, comments="")
     with pytest.raises(GroundedError, match=holding("cmd.csv and mocap.csv", ".npz")):
         w.ingest(tmp_path / "run")
-    docs = Path(__file__).parents[4] / "docs/log-reference.md"
+    docs = Path(__file__).parents[3] / "docs/log-reference.md"
     (lines,) = re.findall(r"```python\n(.*?np\.savez.*?)```", docs.read_text(), re.DOTALL)
     exec(compile(lines, str(docs), "exec"), {})
     assert w.ingest(tmp_path / "run/run.npz").candidate == ran.id
