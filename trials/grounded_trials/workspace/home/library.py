@@ -128,7 +128,7 @@ def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]
     Raises:
         GroundedError: if a file is no actuator, or no input takes its commands.
     """
-    model, effects, priors = workspace.base_model, list[dict[str, Any]](), dict[str, float]()
+    model, effects, priors = workspace.base_model, dict[str, dict[str, Any]](), dict[str, float]()
     driven = _driven(model)
     for text in actuators:
         file, _, names = text.rpartition(":") if not Path(text).is_file() else (text, "", "")
@@ -142,10 +142,10 @@ def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]
             raise unknown("input", names, model.input_names)
         for name in inputs:
             _begin(path, table, name, driven.get(name, ""), effects, priors)
-    set_keys(workspace.config.file, "model", effects=effects, priors=priors)
+    set_keys(workspace.config.file, "model", effects=[*effects.values()], priors=priors)
     workspace.forget()
     _ = workspace.planner  # raises if the model can't be built from them
-    return tuple(effects)
+    return tuple(effects.values())
 
 
 def _begin(
@@ -153,30 +153,24 @@ def _begin(
     table: Mapping[str, Any],
     name: str,
     drives: str,
-    effects: list[dict[str, Any]],
+    effects: dict[str, dict[str, Any]],
     priors: dict[str, float],
 ) -> None:
-    """Add the effects of one input, and how sure their values are."""
-    loaded = "load_dependence" in table
+    """Add the effects of one input by their names, and how sure their values are."""
     for key, (family, q) in KEYS.items():
         if key not in table:
             continue
-        family = "load_friction" if loaded and family == "joint_friction" else family
+        if family == "joint_friction" and "load_dependence" in table:
+            family = "load_friction"
         if family in DRIVES and not drives:
             continue
         value, std = number_in(path, key, table[key])
         effect = f"{family}:{name}<-{drives}" if family in DRIVES else f"{family}:{name}"
-        one = next((e for e in effects if e["name"] == effect), None)
-        if one is None:
-            one = {"name": effect}
-            effects.append(one)
+        rubs = {"c": 0.0, "b": 0.0} if family.endswith("_friction") else {}
+        one = effects.setdefault(effect, {"name": effect, **rubs})
         one[q] = value - 1 if key == "gain" else value
         if math.isfinite(std) and std > 0 and family != "delay":
             priors[param_name(effect, q)] = std
-    for one in effects:
-        if one["name"].startswith(("joint_friction:", "load_friction:")):
-            one.setdefault("c", 0.0)
-            one.setdefault("b", 0.0)
 
 
 def _driven(model: Model) -> dict[str, str]:

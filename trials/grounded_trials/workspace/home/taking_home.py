@@ -95,13 +95,15 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
     held, open_ = Held.of(workspace, known_values(workspace))
     lost = [_not_held(name, c) for name, c in open_]
     dropped = list[Number]()
+    urdf = XmlText(source.read_bytes(), str(source)).root.tag == "robot"
     for _ in range(2):  # again without what the written file does not compile to
-        form = Urdf(source) if _is_urdf(source) else Mjcf(source, held.file)
+        form = Urdf(source) if urdf else Mjcf(source, held.file)
         numbers = held.without(dropped)
         dropped += form.write(numbers)
         numbers = held.without(dropped)
         taken = {n.name: Value(n.value, n.std, n.unit, n.was) for n in numbers}
-        told = [*lost, *(_no_place(one) for one in dropped)]
+        texts = {n.name: Estimate(n.value, n.std, unit=n.unit).text for n in dropped}
+        told = [*lost, *(finding("model.no_place", n, value=text) for n, text in texts.items())]
         date, comment = _comment(workspace, taken, told)
         files = form.files(path, commented(comment))
         if not (missed := _missed(source, path, files, numbers)):
@@ -123,12 +125,6 @@ def _not_held(effect: str, c: Mapping[str, Estimate]) -> Finding:
     return finding("model.no_place", effect, equation=equation, values=values)
 
 
-def _no_place(number: Number) -> Finding:
-    """Return the finding of a number that the file has no place for."""
-    text = Estimate(number.value, number.std, unit=number.unit).text
-    return finding("model.no_place", number.name, value=text)
-
-
 def _missed(
     source: Path, path: Path, files: Mapping[Path, bytes], numbers: Sequence[Number]
 ) -> list[Number]:
@@ -146,10 +142,6 @@ def _missed(
         compiled = load(folder / path.name)
     apart = [abs(value_of(compiled, n.kind, n.index, n.field) - n.value) for n in numbers]
     return [n for n, far in zip(numbers, apart, strict=True) if far > WRITTEN * abs(n.value)]
-
-
-def _is_urdf(source: Path) -> bool:
-    return XmlText(source.read_bytes(), str(source)).root.tag == "robot"
 
 
 def _python_file(workspace: Folder) -> Path | None:
