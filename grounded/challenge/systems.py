@@ -98,14 +98,13 @@ def _swing(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Arr
 
 
 def _fly(rng: np.random.Generator, t: Array, model: Model) -> tuple[Array, Array]:
-    level = level_trim(model, np.array([10.0]), np.array([0.0]), float(t[1] - t[0]))
-    u = np.tile(level.inputs[0], (len(t), 1))
+    start, held = level_trim(model, 10.0, dt=float(t[1] - t[0]))
+    u = np.tile(held, (len(t), 1))
     names = model.input_names
     u[:, names.index("throttle")] += 0.15 * steps(rng, t, -1, 1, 2.0)
     u[:, names.index("aileron")] += 0.03 * wave(rng, t, 2, 0.2, 0.8)
     u[:, names.index("elevator")] += 0.04 * wave(rng, t, 2, 0.2, 0.8)
     u[:, names.index("rudder")] += 0.06 * wave(rng, t, 2, 0.2, 0.8)
-    start = level.states[0].copy()
     start[model.state_names.index("altitude")] = 50.0
     return u, start
 

@@ -85,7 +85,7 @@ def flight_task(model: Model, started_by: Model | None = None) -> Task:
     target[:, columns] = path
     weights = np.zeros(model.n)
     weights[columns] = POSITION
-    start = level_trim(model if started_by is None else started_by, speed[:1], np.zeros(1), DT)
+    start, held = level_trim(started_by or model, float(speed[0]), dt=DT)
     low, high = np.array([LIMITS[name] for name in model.input_names]).T
     ones = np.ones(model.m)
     return Task(
@@ -93,8 +93,8 @@ def flight_task(model: Model, started_by: Model | None = None) -> Task:
         dt=DT,
         target=target,
         reward=Reward(weights, np.zeros(model.n), INPUT * ones, CHANGE * ones),
-        start=start.states[0],
-        past=start.inputs[0],
+        start=start,
+        past=held,
         low=low,
         high=high,
     )

@@ -12,38 +12,25 @@ simulation and works for any model with an aircraft's states, including adopted 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from grounded.checks import known, wrong
-from grounded.frozen import Array, readonly
+from grounded.frozen import Array
 from grounded.model import Model
 
-GRAVITY = 9.81  # [m/s2], for the first guess of the bank angle
-STEADY = ("u", "v", "w", "phi", "theta", "p", "q", "r", "altitude")
-FREE = ("u", "v", "w", "phi", "theta", "p", "q", "r")
+GRAVITY, ATTACK = 9.81, 0.1  # [m/s2, rad] of the first guess
+STEADY = ("u", "v", "w", "phi", "theta", "p", "q", "r", "altitude", "psi")
 
 
-@dataclass(frozen=True, eq=False)
-class Trim:
-    """States (N, 12) at the origin with a track due north, and inputs (N, 4)."""
-
-    states: Array
-    inputs: Array
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "states", readonly(self.states))
-        object.__setattr__(self, "inputs", readonly(self.inputs))
-
-
-def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -> Trim:
-    """Return the trim of steady level flight for each pair of airspeed and turn rate.
+def level_trim(
+    model: Model, speed: float, turn_rate: float = 0.0, dt: float = 0.02
+) -> tuple[Array, Array]:
+    """Return states (12,) at the origin with a track due north, and inputs (4,), of level flight.
 
     Args:
         model: a model with the state and input names of `grounded.models.aircraft`.
-        speed: airspeed V [m/s], (N,).
-        turn_rate: omega [rad/s], positive to the right, (N,).
+        speed: airspeed V [m/s].
+        turn_rate: omega [rad/s], positive to the right.
         dt: control step [s].
 
     Raises:
@@ -51,59 +38,40 @@ def level_trim(model: Model, speed: Array, turn_rate: Array, dt: float = 0.02) -
     """
     from scipy.optimize import root  # a fifth of a second
 
-    speed, turn_rate = np.broadcast_arrays(np.atleast_1d(speed), np.atleast_1d(turn_rate))
     names = model.state_names
-    known("state", [*FREE, "north", "east", "altitude", "psi"], names, f"model '{model.name}'")
-    x, a = _first_guess(model, speed, turn_rate)
-    free, n = [names.index(name) for name in FREE], len(FREE)
-    rows = [names.index(name) for name in (*STEADY, "psi")]
-    body, psi = [names.index(name) for name in ("u", "v", "w")], names.index("psi")
-    worst = 0.0
-    for k, (V, omega) in enumerate(zip(speed.tolist(), turn_rate.tolist(), strict=True)):
-
-        def unmet(unknown: Array, k: int = k, V: float = V, omega: float = omega) -> Array:
-            x[k, free], a[k] = unknown[:n], unknown[n:]
-            rate = (model.system.step(x[k : k + 1], a[k : k + 1], model.values, dt)[0] - x[k]) / dt
-            rate[psi] -= omega
-            return np.array([*rate[rows], np.linalg.norm(x[k, body]) - V, x[k, names.index("v")]])
-
-        with np.errstate(all="ignore"):
-            found = root(unmet, np.append(x[k, free], a[k]), tol=1e-13).x
-            worst = max(worst, float(np.nan_to_num(np.abs(unmet(found)).max(), nan=np.inf)))
-    if not worst < 1e-6:
-        got = (
-            f"{speed.min():.2f} to {speed.max():.2f} m/s, up to {np.abs(turn_rate).max():.2f} rad/s"
-        )
-        raise wrong("speed and turn rate", got=got, must="level")
-    return Trim(_due_north(model, x, a, dt), a)
-
-
-def _first_guess(model: Model, speed: Array, turn_rate: Array) -> tuple[Array, Array]:
-    """Return a coordinated turn by the point-mass equations, at an angle of attack of 0.1 rad."""
+    known("state", [*STEADY, "north", "east"], names, f"model '{model.name}'")
+    rows = [names.index(name) for name in STEADY]
+    free, psi, n = rows[:8], rows[9], 8
+    # a coordinated turn by the point-mass equations
     bank = np.arctan(speed * turn_rate / GRAVITY)
-    attack = np.full_like(speed, 0.1)
-    pitch = attack * np.cos(bank)
+    pitch = ATTACK * np.cos(bank)
     guess = {
-        "u": speed * np.cos(attack),
-        "w": speed * np.sin(attack),
+        "u": speed * np.cos(ATTACK),
+        "w": speed * np.sin(ATTACK),
         "phi": bank,
         "theta": pitch,
         "p": -turn_rate * np.sin(pitch),
         "q": turn_rate * np.sin(bank) * np.cos(pitch),
         "r": turn_rate * np.cos(bank) * np.cos(pitch),
     }
-    zero = np.zeros_like(speed)
-    x = np.stack([guess.get(name, zero) for name in model.state_names], axis=1)
-    a = np.stack([zero + 0.5 * (name == "throttle") for name in model.input_names], axis=1)
+    x = np.array([guess.get(name, 0.0) for name in names])
+    a = np.array([0.5 * (name == "throttle") for name in model.input_names])
+
+    def moved() -> Array:
+        return np.asarray(model.system.step(x[None], a[None], model.values, dt)[0])
+
+    def unmet(unknown: Array) -> Array:
+        x[free], a[:] = unknown[:n], unknown[n:]
+        rate = (moved() - x) / dt
+        rate[psi] -= turn_rate
+        return np.array([*rate[rows], np.linalg.norm(x[free[:3]]) - speed, x[free[1]]])
+
+    with np.errstate(all="ignore"):
+        left = unmet(root(unmet, np.append(x[free], a), tol=1e-13).x)
+    if not np.abs(left).max() < 1e-6:
+        got = f"{speed:.2f} m/s, {turn_rate:.2f} rad/s"
+        raise wrong("speed and turn rate", got=got, must="level")
+    # the track, not the nose, points north in the middle of the step
+    after, north, east = moved(), names.index("north"), names.index("east")
+    x[psi] -= np.arctan2(after[east], after[north]) - 0.5 * (after[psi] - x[psi])
     return x, a
-
-
-def _due_north(model: Model, x: Array, a: Array, dt: float) -> Array:
-    """Turn each heading so that the track (not the nose) points north in the middle of the step."""
-    names = model.state_names
-    moved = model.system.step(x, a, model.values, dt)
-    north, east, psi = (names.index(name) for name in ("north", "east", "psi"))
-    track = np.arctan2(moved[:, east], moved[:, north]) - 0.5 * (moved[:, psi] - x[:, psi])
-    x = x.copy()
-    x[:, psi] -= track
-    return x
