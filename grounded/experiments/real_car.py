@@ -9,6 +9,7 @@ speed with the heading, understeer, a servo that saturates softly, and a latency
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -76,29 +77,13 @@ def dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
     }
 
 
-def real_car(calibration: dict[str, float] | None = None, unmodelled: bool = True) -> Model:
-    """Return the true dynamics, optionally with other calibration errors or without the effects.
-
-    Args:
-        calibration: true value over the crude model's, by parameter name.
-        unmodelled: whether the effects without a term in the crude model are present.
-    """
-    factors = CALIBRATION if calibration is None else calibration
+def real_car() -> Model:
+    """Return the true dynamics."""
     params = {
-        name: Param(param.value * factors.get(name, 1.0), param.unit)
+        name: Param(param.value * CALIBRATION.get(name, 1.0), param.unit)
         for name, param in car.model.params.items()
     }
-    for name, param in UNMODELLED.items():
-        params[name] = param if unmodelled else Param(0.0, param.unit)
-    return Model(
-        name="real car",
-        states=car.model.states,
-        inputs=car.model.inputs,
-        params=params,
-        angles=car.model.angles,
-        roles=car.model.roles,
-        derivative=dynamics,
-    )
+    return replace(car.model, name="real car", params={**params, **UNMODELLED}, derivative=dynamics)
 
 
 def real_plant(noisy: bool = False) -> Plant:

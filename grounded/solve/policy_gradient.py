@@ -25,10 +25,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.checks import of_shape
 from grounded.compile import Problem
-from grounded.compile.run.interpreted import Quadratic
-from grounded.compile.run.interpreted import linearised as quadratic_model
+from grounded.compile.run.interpreted import linearised
 from grounded.frozen import Array, wrapped
 from grounded.rollout import simulate
 
@@ -48,103 +46,60 @@ class Gradient:
     gain: Array | None = None
 
 
-def gradient(problem: Problem, z: Array, u: Array, policy: Policy | None = None) -> Gradient:
+def gradient(
+    problem: Problem, z: Array, u: Array, policy: Policy | None = None, held: bool = True
+) -> Gradient:
     """dJ/dtheta along z (H+1, nz), u (H, m), which `policy` (None: open loop) has produced.
 
-    Raises:
-        GroundedError: for arrays that do not fit, or a policy about another z.
-    """
-    local = linearised(problem, z, u)
-    free = free_inputs(problem, u)
-    if policy is None or policy.gain is None or policy.reference is None:
-        g, _ = adjoint(local, np.zeros((*u.shape, z.shape[1])), free)
-        return Gradient(g * free)
-    of_shape("gain", policy.gain, (*u.shape, z.shape[1]))
-    g, _ = adjoint(local, policy.gain, free)
-    dz = wrapped(z[:-1] - policy.reference, problem.angles)
-    return Gradient(g * free, (g * free)[:, :, None] * dz[:, None, :])
-
-
-def linearised(problem: Problem, z: Array, u: Array) -> Quadratic:
-    """The problem's dynamics and cost about z (H+1, nz), u (H, m)."""
-    H, nz = problem.horizon, problem.nz
-    of_shape("states of a trajectory", z, (H + 1, nz))
-    of_shape("inputs of a trajectory", u, (H, problem.system.m))
-    return quadratic_model(problem.system, problem, z, u)
-
-
-def adjoint(local: Quadratic, answer: Array, free: Array) -> tuple[Array, Array]:
-    """The backward pass: g (H, m) and lambda (H+1, nz).
-
     Args:
-        local: dynamics and cost along the trajectory.
-        answer: pi_z (H, m, nz), how inputs answer the state.
-        free: (H, m) 1 where an input is not held by a limit, else 0.
+        problem: the biased model.
+        z: the trajectory.
+        u: its inputs.
+        policy: theta; its gains are about the problem's z.
+        held: whether limits hold the inputs that lie on them.
     """
-    H = len(answer)
-    g, slope = np.empty(answer.shape[:2]), np.empty_like(local.l_z)
-    slope[H] = local.l_z[H]
+    local = linearised(problem.system, problem, z, u)
+    free = np.where(held & ((u <= problem.low) | (u >= problem.high)), 0.0, 1.0)  # C
+    gain, zbar = (None, None) if policy is None else (policy.gain, policy.reference)
+    g, slope = np.empty_like(u), local.l_z[-1]  # slope: lambda
     with np.errstate(all="ignore"):
-        for t in range(H - 1, -1, -1):
-            g[t] = local.l_u[t] + local.B[t].T @ slope[t + 1]
-            slope[t] = local.l_z[t] + local.A[t].T @ slope[t + 1] + answer[t].T @ (free[t] * g[t])
-    return g, slope
-
-
-def free_inputs(problem: Problem, u: Array) -> Array:
-    """1 where an input is strictly inside its limits."""
-    return ((u > problem.low) & (u < problem.high)).astype(float)
+        for t in range(len(u) - 1, -1, -1):
+            g[t] = free[t] * (local.l_u[t] + local.B[t].T @ slope)
+            slope = local.l_z[t] + local.A[t].T @ slope
+            if gain is not None:
+                slope = slope + gain[t].T @ g[t]
+    if gain is None or zbar is None:
+        return Gradient(g)
+    return Gradient(g, g[:, :, None] * wrapped(z[:-1] - zbar, problem.angles)[:, None, :])
 
 
 def ascent(task: Task, policy: Policy, grounding: Grounding) -> Policy:
     """Step 5 by Eq. (4): theta' = theta + s (dU/dtheta), s the best length in the biased model.
 
-    The policy itself when no length gains anything: then it is stationary in the biased model.
+    The policy itself when no length gains anything: then it is stationary in the biased model. An
+    input at its limit does not move the cost while the policy asks for more than the limit; but an
+    open-loop sequence lies ON the limit, and may come back from it.
 
     Args:
         task: the manoeuvre, with the original model.
         policy: theta, that ran the trial.
         grounding: the trial as the biased model replays it.
     """
-    problem = grounding.on(task.problem())
-    found = gradient(problem, grounding.z, grounding.inputs, policy)
-    scale = problem.input_scale
-    d = -_descended(problem, grounding, found.inputs) / scale
-    D = None if found.gain is None else -found.gain / scale[:, None]
-
-    def moved(length: float) -> Policy:
-        gain = policy.gain
-        if gain is not None and D is not None:
-            gain = gain + length * D
-        forward = policy.feedforward + length * d
-        return replace(policy, feedforward=np.clip(forward, *_room(policy, forward)), gain=gain)
-
+    problem, z, u = grounding.on(task.problem()), grounding.z, grounding.inputs
+    found, scale = gradient(problem, z, u, policy), problem.input_scale
+    full = gradient(problem, z, u, held=False).inputs
+    inward = ((u <= problem.low) & (full < 0)) | ((u >= problem.high) & (full > 0))
+    d = -np.where(inward, full, found.inputs) / scale
+    D = 0.0 if found.gain is None else -found.gain / scale[:, None]
+    limits = (policy.low, policy.high) if policy.gain is None else (-np.inf, np.inf)
     best, lowest = policy, -simulate(problem, policy).utility
     for length in LENGTHS.tolist():
-        candidate = moved(length)
+        gain = None if policy.gain is None else policy.gain + length * D
+        forward = np.clip(policy.feedforward + length * d, *limits)
+        candidate = replace(policy, feedforward=forward, gain=gain)
         cost = -simulate(problem, candidate).utility
         if cost < lowest:
             best, lowest = candidate, cost
         elif best is not policy:
             break  # shorter ones gain less and less
     return best
-
-
-def _descended(problem: Problem, grounding: Grounding, g: Array) -> Array:
-    """The gradient without what pushes inputs that sit at a limit further out.
-
-    An input at its limit does not move the cost while the policy asks for more than the limit; but
-    an open-loop sequence lies ON the limit, and may come back from it.
-    """
-    local = linearised(problem, grounding.z, grounding.inputs)
-    full, _ = adjoint(local, np.zeros((*g.shape, problem.nz)), np.zeros_like(g))
-    u = grounding.inputs
-    inward = ((u <= problem.low) & (full < 0)) | ((u >= problem.high) & (full > 0))
-    return np.where(inward, full, g)
-
-
-def _room(policy: Policy, forward: Array) -> tuple[Array, Array]:
-    """Limits of a feed-forward: the inputs' own without feedback, none with it."""
-    if policy.gain is None:
-        return policy.low, policy.high
-    return np.full_like(forward, -np.inf), np.full_like(forward, np.inf)

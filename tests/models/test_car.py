@@ -124,7 +124,8 @@ def test_the_real_car_differs_where_it_is_said_to():
 
 
 def test_without_its_effects_and_errors_it_is_the_model():
-    same = real_car({}, unmodelled=False)
+    crude = dict(zip(model.param_names, model.values.tolist(), strict=True))
+    same = real_car().with_values({**crude, **dict.fromkeys(UNMODELLED, 0.0)})
     a = simulate(0.4, 0.6, 3.0)
     b = simulate(0.4, 0.6, 3.0, of=same)
     for name in model.state_names:
