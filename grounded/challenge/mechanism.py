@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -161,17 +160,18 @@ class Mechanism:
 
     def plant(self, fine: float) -> Plant:
         """Return the mechanism at rest, which advances by `fine` seconds at a time."""
-        count = int(np.ceil(fine / STEP))
-        return Plant(self.built(self.part, timestep=fine / count, **self.more), count)
+        return Plant(self, fine)
 
 
 class Plant:
     """A running MuJoCo simulation, with the state of actuators, warm start and hanging mass."""
 
-    def __init__(self, xml: str, steps: int) -> None:
-        self.mj, self.steps = simulator(), steps
+    def __init__(self, of: Mechanism, fine: float) -> None:
+        self.mj, self.steps = simulator(), int(np.ceil(fine / STEP))
+        xml = of.built(of.part, timestep=fine / self.steps, **of.more)
         self.model = self.mj.MjModel.from_xml_string(xml)
         self.data = self.mj.MjData(self.model)
+        self.filtered = np.flatnonzero(self.model.actuator_actadr >= 0)  # that have a state
         self.started = False
 
     def advance(self, x: Array, u: Array) -> Array:
@@ -184,11 +184,6 @@ class Plant:
         for _ in range(self.steps):
             self.mj.mj_step(self.model, data)
         return np.concatenate([data.qpos[:half], data.qvel[:half]])
-
-    @cached_property
-    def filtered(self) -> Any:
-        """Indices of the actuators that have a state."""
-        return np.flatnonzero(self.model.actuator_actadr >= 0)
 
 
 def simulator() -> Any:

@@ -90,17 +90,16 @@ def _patch_targets(model: Model) -> list[str]:
     return [*found, *([heading] if heading else [])] if where else []
 
 
-def _body_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
+def _in_the_plane(s: Any, site: Site, ahead: Any, left: Any) -> Values:
+    """Return a velocity ahead and to the left of the heading, by state of the position."""
     x, y = site.targets
     cos, sin = np.cos(s[_heading(site)]), np.sin(s[_heading(site)])
-    return {x: c["a"] * cos - c["b"] * sin, y: c["a"] * sin + c["b"] * cos}
+    return {x: ahead * cos - left * sin, y: ahead * sin + left * cos}
 
 
 def _slip_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    x, y = site.targets
-    psi, v = s[_heading(site)], s[_speed(site)]
-    aside = -c["k"] * v * v * own[_heading(site)]
-    return {x: -aside * np.sin(psi), y: aside * np.cos(psi)}
+    v = s[_speed(site)]
+    return _in_the_plane(s, site, 0.0, -c["k"] * v * v * own[_heading(site)])
 
 
 def _understeer_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -136,9 +135,8 @@ def _corners(model: Model) -> list[str]:
 
 
 def _lever_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    x, y = site.targets
-    cos, sin, turn = np.cos(s[_heading(site)]), np.sin(s[_heading(site)]), own[_heading(site)]
-    return {x: -turn * (c["a"] * sin + c["b"] * cos), y: turn * (c["a"] * cos - c["b"] * sin)}
+    turn = own[_heading(site)]
+    return _in_the_plane(s, site, -turn * c["b"], turn * c["a"])
 
 
 def _slope_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
@@ -183,7 +181,7 @@ drift_body = RateFamily(
     targets=places.plane,
     quantities=_two_drifts,
     lookalikes=("drift_world", "side_slip", "sensor_bias", "odometry_scale"),
-    rate=_body_rate,
+    rate=lambda s, a, own, t, c, site: _in_the_plane(s, site, c["a"], c["b"]),
 )
 
 side_slip = RateFamily(
