@@ -168,6 +168,11 @@ class Result:
         """Return a short summary, such as the name and the utility."""
         return ""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The sentences of its findings, if it has any."""
+        return tuple(one.sentence for one in getattr(self, "findings", ()))
+
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.summary()}".rstrip() + ">"
 

@@ -229,11 +229,6 @@ class Proposal(Result):
     findings: tuple[Finding, ...] = ()  # on the candidate, or why it was refused
     refused: Candidate | None = None
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.sentence for one in self.findings)
-
     def summary(self) -> str:
         """Return the summary of the candidate, or of the standing if there is none."""
         return self.candidate.summary() if self.candidate else self.standing.summary()

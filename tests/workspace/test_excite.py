@@ -33,6 +33,7 @@ def test_from_a_bare_model_to_fitted_values(tmp_path):
 
 
 CERTAIN = MODEL.replace(', "kg", 0.1, 10.0', "").replace(', "N s/m", 0.0, 5.0', "")
+STUCK = MODEL.replace("a.force", "0.0 * a.force")
 
 
 @pytest.mark.parametrize(
@@ -41,6 +42,7 @@ CERTAIN = MODEL.replace(', "kg", 0.1, 10.0', "").replace(', "N s/m", 0.0, 5.0', 
         ({"config": BARE}, None, "plan.no_drive"),
         ({"config": SAFE.replace("force = [-5.0, 5.0]", "")}, None, "plan.no_limits"),
         ({"config": SAFE, "model": CERTAIN}, None, "given.constant"),
+        ({"config": SAFE, "model": STUCK}, None, "plan.without_effect"),
         ({"config": SAFE}, 0.01, "given.value"),
         ({"config": SAFE + "v = [0.5, 0.6]\n"}, None, "plan.no_drive"),
     ],

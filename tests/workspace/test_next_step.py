@@ -377,9 +377,11 @@ def test_a_delay_that_log_takes_out_by_now_does_not_act_twice(w, now, counted):
     table = f'\n[log.state]\n{state}\n[log.input]\nforce = {{ path = "/csv.force" }}\n'
     w.config.file.write_text(w.config.file.read_text() + table)
     assert following(w.folder).endswith("viscous_friction:v" if counted else "sensor_delay:v")
-    assert grounded("-C", w.folder, "adopt", "viscous_friction:v", "sensor_delay:v").code == 0
-    done = grounded("-C", w.folder, "propose")
+    before = w.config.file.read_text()
+    done = grounded("-C", w.folder, "adopt", "viscous_friction:v", "sensor_delay:v")
     assert done.code == counted and (not counted or "delay_s" in done.err)
+    assert (w.config.file.read_text() == before) == counted
+    assert grounded("-C", w.folder, "propose").code == 0
 
 
 def test_an_adoption_is_undone_and_not_proposed_again_until_a_new_diagnosis(w):

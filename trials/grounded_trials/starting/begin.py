@@ -116,11 +116,6 @@ class Begun(Document):
         return f"{self.workspace}: {sum(bool(g.path) for g in both)} of {len(both)} signals found"
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.sentence for one in self.findings)
-
-    @property
     def signals(self) -> list[SignalJson]:
         """What was found of each state and input."""
         return [

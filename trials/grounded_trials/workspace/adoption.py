@@ -36,7 +36,7 @@ from grounded_trials.workspace.last_diagnosis import (
     since_diagnosis,
 )
 from grounded_trials.workspace.new_target import to_plan
-from grounded_trials.workspace.readings import changed_since, last_again, taken_out
+from grounded_trials.workspace.readings import changed_since, last_again, taken_out, twice_in_time
 from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_keys
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
@@ -223,6 +223,8 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     file, model, known = workspace.config.file, workspace.config.model, diagnosis.made
     nominal = _nominal(workspace, diagnosis)
     own, adopted = joined(diagnosis, names, model.effects, nominal, calibrated)
+    if twice := twice_in_time(workspace, adopted):
+        raise GroundedError(twice)
     params = dict(model.params) | own
     earlier = kept(workspace).adoptions  # raises before anything is written, as does
     planner_of(workspace.task, adopted)  # a model that can't be built from these effects

@@ -20,6 +20,7 @@ from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.candidates.at_rest import resting
 from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.first_plan import idle_inputs, no_effect
 from grounded_trials.workspace.diagnosing import near, probe_candidate
 from grounded_trials.workspace.folder import Folder
 
@@ -71,10 +72,14 @@ def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:
             leaves no parameter weak, or no fewer if longer.
 
     Raises:
-        GroundedError: if no parameter is uncertain, an input has no limits, nothing bounds the
-            states, or no drive stays inside [safety].
+        GroundedError: if no parameter is uncertain, an input has no limits, none moves the model,
+            nothing bounds the states, or no drive stays inside these bounds.
     """
     task = _bounded(workspace)
+    idle = idle_inputs(workspace.task, workspace.task.start[None], workspace.task.past[None])
+    told = [no_effect(workspace, idle)] if idle else []
+    if len(idle) == task.model.m:
+        raise GroundedError(told[0].weighing(Weight.REFUSE))
     lengths = LENGTHS if seconds is None else (seconds,)
     hidden = task.model.state_names[workspace.base_model.n :]
     noise = np.zeros(task.model.n)
@@ -92,7 +97,7 @@ def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:
             break
     if drive is None:
         raise GroundedError(found("plan.no_drive"))
-    told = [found("plan.drive_weak", *drive.weak)] if drive.weak else []
+    told += [found("plan.drive_weak", *drive.weak)] if drive.weak else []
     policy = workspace.planner.narrowed(drive.policy)
     candidate = workspace.save_probe(probe_candidate(workspace, policy, drive.run))
     slow, quick = drive.cycles

@@ -12,7 +12,7 @@ import os
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -185,14 +185,22 @@ def taken_out(workspace: Folder) -> dict[str, float]:
     return {n: one.delay_s - before.get(n, UNCHANGED).delay_s for n, one in log.items()}
 
 
-def twice_in_time(workspace: Folder) -> Said | None:
-    """Return that [log] now removes delays that adopted effects have in the model as well."""
-    named = {str(one["name"]): float(one.get("d", 0.0)) for one in workspace.config.model.effects}
+def twice_in_time(
+    workspace: Folder, effects: Sequence[Mapping[str, Any]] | None = None
+) -> Said | None:
+    """Return that [log] now removes delays that the model has as well.
+
+    Args:
+        workspace: the workspace with [log].
+        effects: the model's effects; None for those that are adopted.
+    """
+    effects = workspace.config.model.effects if effects is None else effects
+    named = {str(one["name"]): float(one.get("d", 0.0)) for one in effects}
     late = {n.removeprefix(SENSOR_DELAY): d for n, d in named.items() if SENSOR_DELAY in n}
     gone = taken_out(workspace) if late else {}
     twice = [name for name, d in late.items() if gone.get(name, 0.0) > d / 2 > 0]
     if not twice:
         return None
     keys = tuple(f"[log.state.{name}] delay_s" for name in twice)
-    effects = tuple(SENSOR_DELAY + name for name in twice)
-    return said("plan.delay_twice", *twice, keys=keys, effects=effects)
+    both = tuple(SENSOR_DELAY + name for name in twice)
+    return said("plan.delay_twice", *twice, keys=keys, effects=both)

@@ -173,11 +173,6 @@ class Exported(Document):
     search_ended: bool = False  # whether it is the best candidate of a search that has ended
     named: tuple[str, ...] = field(metadata=UNSAID, default=())  # options of `next` for its log
 
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.sentence for one in self.findings)
-
     def summary(self) -> str:
         """Return the candidate and its file."""
         return f"{self.candidate}: {self.file}"

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
+from grounded.frozen import Array
 from grounded.places import samples
 from grounded.task import Task
 from grounded_trials.workspace.candidates.at_rest import held_before
@@ -31,13 +32,7 @@ MISSED, SHORT, LIMITED = 0.05, 0.25, 0.25
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """The first plan of a workspace, or why there is none, with what several checks need.
-
-    Args:
-        workspace: a workspace in which nothing was run yet.
-        made: the first candidate; None if it was refused.
-        refused: the refused one; None if there is a candidate.
-    """
+    """The first plan of a workspace: `made` is None if it was refused, `refused` if it was not."""
 
     workspace: Folder
     made: Candidate | None
@@ -47,21 +42,6 @@ class Plan:
     def task(self) -> Task:
         """The task with the crude model."""
         return self.workspace.task
-
-    def at_limits(self, made: Candidate) -> dict[str, float]:
-        """Return the share of a plan for which each input is at one of its limits."""
-        task, aim, shares = self.task, self.task.input_target, {}
-        assert aim is not None
-        for j, name in enumerate(task.model.input_names):
-            ends = [end for end in (task.low[j], task.high[j]) if np.isfinite(end)]
-            sent = made.predicted_inputs[:, j]
-            at = [
-                np.isclose(sent, end, rtol=1e-3, atol=1e-9)
-                for end in ends
-                if not np.allclose(aim[:, j], end)
-            ]
-            shares[name] = float(np.any(at, axis=0).mean()) if at else 0.0
-        return shares
 
 
 def left_open(workspace: Folder, proposal: Proposal) -> list[Finding]:
@@ -85,18 +65,20 @@ def no_limits(plan: Plan) -> Iterator[Finding]:
         yield found("plan.no_limits", *free)
 
 
-def without_effect(plan: Plan) -> Iterator[Finding]:
-    """An input changes no step of the model, along the plan or elsewhere, at either of its limits.
+def idle_inputs(task: Task, states: Array, inputs: Array) -> list[str]:
+    """Return the inputs that change no step of the model at either of their limits.
 
     An example is a gain that is still 0 in a model skeleton. A rudder acts only at some speed, and
     a plan may stay at rest: so the model is also probed at other states and inputs.
+
+    Args:
+        task: the task with the model and the limits.
+        states: where the model is probed too (N, n).
+        inputs: the inputs there (N, m).
     """
-    if plan.made is None:
-        return
-    task, sent, idle = plan.task, plan.made.predicted_inputs, []
-    states, inputs = samples(task.model, 8)
-    x = np.concatenate([plan.made.predicted_states[: len(sent)], states])
-    sent = np.concatenate([sent, np.clip(inputs, task.low, task.high)])
+    some, sent = samples(task.model, 8)
+    x = np.concatenate([states, some])
+    sent, idle = np.concatenate([inputs, np.clip(sent, task.low, task.high)]), []
     for j, name in enumerate(task.model.input_names):
         after = []
         for end, other in ((task.low[j], sent[:, j] - 1), (task.high[j], sent[:, j] + 1)):
@@ -105,9 +87,20 @@ def without_effect(plan: Plan) -> Iterator[Finding]:
             after.append(task.model.system.step(x, u, task.model.values, task.dt))
         if task.low[j] < task.high[j] and np.array_equal(after[0], after[1]):
             idle.append(name)
-    if idle:
-        file = plan.workspace.config.model.file or "the model"
-        yield found("plan.without_effect", *idle, file=file)
+    return idle
+
+
+def without_effect(plan: Plan) -> Iterator[Finding]:
+    """An input changes no step of the model, along the plan or elsewhere."""
+    if plan.made is not None:
+        sent = plan.made.predicted_inputs
+        if idle := idle_inputs(plan.task, plan.made.predicted_states[: len(sent)], sent):
+            yield no_effect(plan.workspace, idle)
+
+
+def no_effect(workspace: Folder, idle: Sequence[str]) -> Finding:
+    """Return that inputs have no effect in the model."""
+    return found("plan.without_effect", *idle, file=workspace.config.model.file or "the model")
 
 
 def limits_of_log(plan: Plan) -> Iterator[Finding]:
@@ -120,18 +113,28 @@ def off_target(plan: Plan) -> Iterator[Finding]:
     """The plan misses its target: by [limits], by other weights, or as the model can't reach it."""
     if plan.made is None or not weighed_groups(plan.task):
         return
-    task, shares, error = plan.task, plan.at_limits(plan.made), []
-    at = [name for name, share in shares.items() if share > LIMITED]
-    missed = tracking_error(task, plan.made.predicted_run)
+    task, sent, aim = plan.task, plan.made.predicted_inputs, plan.task.input_target
+    assert aim is not None
+
+    # The share of the plan for which each input is at a limit that it does not aim at.
+    at_limit = np.zeros(sent.shape, bool)
+    for end in (task.low, task.high):
+        meant = np.isclose(aim, end).all(axis=0) | ~np.isfinite(end)
+        at_limit |= np.isclose(sent, end, rtol=1e-3, atol=1e-9) & ~meant
+    shares = at_limit.mean(axis=0)
+    at = [name for name, share in zip(task.model.input_names, shares, strict=True) if share > LIMITED]
+
+    # The largest error there, or else that at the end, as a share of what the target extends over.
+    missed, errors = tracking_error(task, plan.made.predicted_run), []
     for names, what in weighed_groups(task):
         states = [task.model.state_names.index(name) for name in names]
         far = np.linalg.norm(missed[:, states], axis=1)
         off = float(far.max() if at else far[-1])
         extent = np.ptp(np.vstack([task.start, task.target])[:, states], axis=0)
-        error.append((off / max(float(np.linalg.norm(extent)), 1e-300), off, what, names[0]))
-    share, off, what, name = max(error) if at else error[0]
+        errors.append((off / max(float(np.linalg.norm(extent)), 1e-300), off, what, names[0]))
+    share, off, what, name = max(errors) if at else errors[0]
     if share > (MISSED if at else SHORT):
-        most = max(shares.values()) if at else None
+        most = float(shares.max()) if at else None
         missing = Quantity(off, task.model.states[name])
         yield found("plan.falls_short", *at, share=most, what=what, off=missing)
 

@@ -65,11 +65,6 @@ class Proposed(Result):
     extent: tuple[Extent, ...] = ()  # where the predicted run goes
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.sentence for one in self.findings)
-
-    @property
     def candidate(self) -> Candidate | None:
         """The candidate to run next; None if the search has ended."""
         return self.proposal.candidate
@@ -109,11 +104,6 @@ class Status(Result):
     since: Since | None = None  # what changed since the diagnosis
     adopted: tuple[tuple[str, str], ...] = ()  # name and values of what was adopted
     noise: float | None = None  # how much of the best's cost is sensor noise, if it is much
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.sentence for one in self.findings)
 
     def summary(self) -> str:
         """Return the phase and the best candidate."""

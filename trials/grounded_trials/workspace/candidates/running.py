@@ -42,11 +42,6 @@ class Ran(Document):
     overridden: tuple[Finding, ...] = field(metadata=UNSAID, default=())  # reasons against it
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """The findings in words."""
-        return tuple(one.sentence for one in self.findings)
-
-    @property
     def then(self) -> NextCommand:
         """The command that ingests the trial."""
         return NextCommand("ingest", (str(self.trial_file),))
