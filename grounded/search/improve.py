@@ -165,25 +165,20 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
     # Step 7: no step is worth a trial.
     if proposal is None:
         return Proposal(_ended(make, incumbent, about, options), None, False)
-    if proposal.candidate is not None:
-        noise = _below_noise(make, incumbent, proposal.candidate, options)
-        return proposal if noise is None else Proposal(noise, None, False)
-    return proposal
+    noise = proposal.candidate and _below_noise(make, incumbent, proposal.candidate, options)
+    return Proposal(noise, None, False) if noise else proposal
 
 
 def _step(about: About) -> Proposal | None:
-    """Return the due step, by the derivatives that promise most."""
-    base, due = about.incumbent.candidate, about.make.now.step
-    assert due is not None
+    """Return the due step, by the derivatives that promise most.
 
-    # Steps of derivatives that hold for each step of the run by itself go on.
-    by_step = _by_step(about)
+    Steps of derivatives that hold for each step of the run by itself go on.
+    """
+    base, due, by_step = about.incumbent.candidate, about.make.now.step, _by_step(about)
+    assert due is not None
     if by_step is not None and base.way == BY_STEP and base.model == about.make.fingerprint:
         return by_step
-
-    # Else they make the step if that promises more.
-    made = about.step_from(due)
-    return made if _promise(made) >= _promise(by_step) else by_step
+    return max((about.step_from(due), by_step), key=_promise)  # the first of equal ones
 
 
 def _promise(made: Proposal | None) -> float:
@@ -200,11 +195,6 @@ def _by_step(about: About) -> Proposal | None:
     stepping = About(make, about.incumbent, options, BY_STEP)
     made = stepping.step_from(step) if stepping.corrected else None
     return made if made and made.candidate else None
-
-
-def _steps_lost(make: Maker, own: str) -> int:
-    """Return how many steps from a candidate lost, with the model as it is now."""
-    return len(losers_of(make.now.history, own, make.fingerprint))
 
 
 def _below_noise(
@@ -224,39 +214,30 @@ def _below_noise(
         return None
     if gain > 0 and best.is_unsteady:
         return None
-    own = best.candidate.id
-    less = found(
-        "search.no_step",
-        own,
-        best=own,
-        lost=_steps_lost(make, own),
-        gain=gain if gain > 0 else None,
-        error=error,
-    )
-    return let_down(ended(make.now, Ending.BELOW_NOISE, less), make.fingerprint)
+    return _no_step(make, best, Ending.BELOW_NOISE, gain=gain if gain > 0 else None, error=error)
 
 
 def _ended(make: Maker, incumbent: Tried, rejected: About, options: SearchOptions) -> Standing:
     """Return the standing of a search in which no step is worth a trial, with the reason."""
     own, doubted = incumbent.candidate.id, rejected.doubted
+    lost = losers_of(make.now.history, own, make.fingerprint)
     finite = [gain for gain in rejected.promised if np.isfinite(gain)]
-    lost, most = _steps_lost(make, own), max(finite, default=0.0)
-    ask = found("search.diagnose", then=DIAGNOSE)
+    most, ask = max(finite, default=0.0), found("search.diagnose", then=DIAGNOSE)
     if doubted is None and rejected.promised and not finite:
         return ended(make.now, Ending.DIVERGES, found("search.diverges", own, best=own), ask)
     if doubted is None and most < -rejected.least and not lost:
         why = found("search.diverges", own, best=own, least=-most)
         return ended(make.now, Ending.EVERY_STEP_LOSES, why, ask)
-    ending = Ending.NO_STEP if lost or doubted else Ending.NOTHING_PROMISED
-    why = found("search.no_step", own, best=own, least=options.tolerance)
-    if lost or doubted:
-        why = found(
-            "search.no_step",
-            own,
-            best=own,
-            lost=lost,
-            gain=doubted.predicted_gain if doubted else None,
-            error=doubted.likely_off if doubted else None,
-            least=None if doubted else options.tolerance,
-        )
+    if doubted is not None:
+        gain, error = doubted.predicted_gain, doubted.likely_off
+        return _no_step(make, incumbent, Ending.NO_STEP, gain=gain, error=error)
+    ending = Ending.NO_STEP if lost else Ending.NOTHING_PROMISED
+    return _no_step(make, incumbent, ending, least=options.tolerance)
+
+
+def _no_step(make: Maker, best: Tried, ending: Ending, **facts: float | None) -> Standing:
+    """Return the ended search, with the steps from the best one that lost with this model."""
+    own = best.candidate.id
+    lost = len(losers_of(make.now.history, own, make.fingerprint)) or None
+    why = found("search.no_step", own, best=own, lost=lost, **facts)
     return let_down(ended(make.now, ending, why), make.fingerprint)

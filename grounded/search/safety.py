@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -25,45 +24,25 @@ from grounded.trial import Trial
 
 COASTS = 2.0  # [s] time after a run that is checked
 MAX_GAIN = 1e6  # input units per state unit; a larger gain is a numerical error
-# share of the squared scatter that marks one run; a single outlier of three makes 2 / 3
-ONE_RUN_SHARE = 0.6
 
 
-@dataclass(frozen=True, eq=False)
-class Strays:
-    """Deviations of real runs from predictions or repeats, and the trial that causes most of it.
-
-    Args:
-        size: deviation in units of the states, (H + 1, n).
-        trial: id of the trial that causes most of it, (H + 1, n); "" if none does.
-    """
-
-    size: Array
-    trial: Array
-
-
-def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
-    """Return the deviations of real runs so far; zero before the first run.
+def spread(task: Task, history: Sequence[Tried], model: str) -> Array:
+    """Return the deviations of real runs so far, (H + 1, n); zero before the first run.
 
     This is the larger of two standard deviations between repeated runs of one candidate, and the
     error of the latest prediction of a step by this model, grounded on a trial. Errors of other
     models, or of the model without a bias, do not count: they don't apply to the next step.
     """
     size = np.zeros((task.horizon + 1, task.model.n))
-    whose = np.full(size.shape, "", dtype=object)
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([task.safety_low, task.safety_high]).any():
-        return Strays(size, whose)  # no [safety] to check
+        return size  # no [safety] to check
     for tried in history:
         whole = [t for t in tried.trials if t.finite_steps == task.horizon]
         if len(whole) > 1:
             states = np.array([t.states for t in whole])
-            off = task.model.difference(states, np.mean(states, axis=0)) ** 2
-            scatter = 2 * np.sqrt(off.sum(axis=0) / (len(whole) - 1))
-            ids = np.array([t.id for t in whole], dtype=object)[off.argmax(axis=0)]
-            ids[off.max(axis=0) <= ONE_RUN_SHARE * off.sum(axis=0)] = ""
-            whose = np.where(scatter > size, ids, whose)
-            size = np.maximum(size, scatter)
+            off = task.model.difference(states, np.mean(states, axis=0))
+            size = np.maximum(size, 2 * np.sqrt((off**2).sum(axis=0) / (len(whole) - 1)))
     grounded = [
         (tried.candidate.predicted_states, trial)
         for tried in history
@@ -73,13 +52,12 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Strays:
     ]
     if grounded:
         predicted, last = grounded[-1]
-        missed = np.abs(task.model.difference(last.states, predicted))
-        whose, size = np.where(missed > size, last.id, whose), np.maximum(size, missed)
-    return Strays(size, whose)
+        size = np.maximum(size, np.abs(task.model.difference(last.states, predicted)))
+    return size
 
 
 def objections(
-    task: Task, candidate: Candidate, strays: Strays | None = None
+    task: Task, candidate: Candidate, strays: Array | None = None
 ) -> tuple[Finding, ...]:
     """Return the reasons why a candidate must not be run; empty if there are none.
 
@@ -127,19 +105,18 @@ def too_strong(task: Task, candidate: Candidate) -> Finding | None:
     )
 
 
-def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) -> Finding | None:
+def _outside(task: Task, candidate: Candidate, strays: Array | None, i: int) -> Finding | None:
     """Return that state i leaves [safety] in the predicted run; None if it does not."""
     assert task.safety_low is not None and task.safety_high is not None
     low, high = float(task.safety_low[i]), float(task.safety_high[i])
     value = candidate.predicted_states[:, i]
-    stray = np.zeros(len(value)) if strays is None else strays.size[:, i]
+    stray = np.zeros(len(value)) if strays is None else strays[:, i]
     beyond = np.maximum(low - value, value - high)
     excess = beyond + stray
     t = int(np.argmax(excess))
     if excess[t] <= 0:
         return None
     name = task.model.state_names[i]
-    blamed = strays is not None and beyond.max() <= 0
     return found(
         "plan.outside",
         candidate.id,
@@ -151,7 +128,6 @@ def _outside(task: Task, candidate: Candidate, strays: Strays | None, i: int) ->
         at=Quantity(t * task.dt, "s"),
         low=f"{low:g}",
         high=f"{high:g}",
-        trial=str(strays.trial[t, i]) if strays is not None and blamed else None,
     )
 
 

@@ -215,7 +215,7 @@ def _probe(
     low, high = np.maximum(own.low, task.low), np.minimum(own.high, task.high)
     base = planner.widened(replace(own, low=low, high=high))
     plan = near(planner.plan, task.model.n, trials)
-    for room in (0 * strays.size, strays.size):
+    for room in (0 * strays, strays):
         inside = _narrower(plan, room.max(axis=0))
         made = None if inside is None else probe(inside, base, found, trials, library)
         if made is None:

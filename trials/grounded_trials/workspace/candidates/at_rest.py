@@ -127,7 +127,6 @@ def drift(values: Array) -> Array:
     return np.asarray(np.tensordot(t, values, axes=1) / (t**2).sum() * (steps - 1))
 
 
-FARTHEST = 1e4  # largest distance, in its unit, of a free state from where it starts
 UNGIVEN = 3  # largest number of states without a start value that are solved for
 # the robot is at rest if it moves less than this share of the motion as configured
 AT_REST_SHARE = 1e-3
@@ -213,7 +212,7 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
 
     clocks = free & [is_clock(name) for name in task.model.state_names]
     free, away = free & ~clocks, np.abs(moved_at_start(task, task.past))[~clocks].max()
-    if away <= STILL or _out_of_reach(task, free, clocks):
+    if away <= STILL:
         return None
     still = np.tile(task.start, (2, 1))
     still[1, clocks] += task.dt
@@ -228,20 +227,6 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
             if (moved <= AT_REST_SHARE * away).all():
                 return np.append(x, u)
     return None
-
-
-def _out_of_reach(task: Task, free: NDArray[np.bool_], clocks: NDArray[np.bool_]) -> bool:
-    """Return whether no input inside the limits can stop the motion at the start, linearised."""
-    if not np.isfinite(task.high - task.low).all():
-        return False
-    problem = task.problem(exact=True)
-    u = np.array([task.past, task.low, 0.5 * (task.low + task.high), task.high])
-    with np.errstate(all="ignore"):
-        f_x, f_u = problem.system.linearise(np.tile(task.start, (4, 1)), u, problem.p, problem.dt)
-    others = np.abs(f_x - np.eye(len(free))).max(axis=0)[:, free]
-    reach = 2 * np.abs(f_u).max(axis=0) @ (task.high - task.low) + FARTHEST * others.sum(axis=1)
-    inside = np.clip(task.past, task.low, task.high)  # a hover's thrust need not reach down to 0
-    return bool((np.abs(moved_at_start(task, inside)) > reach)[~clocks].any())
 
 
 def moved_at_start(task: Task, inputs: Array) -> Array:

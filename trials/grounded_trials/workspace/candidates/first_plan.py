@@ -122,7 +122,9 @@ def off_target(plan: Plan) -> Iterator[Finding]:
         meant = np.isclose(aim, end).all(axis=0) | ~np.isfinite(end)
         at_limit |= np.isclose(sent, end, rtol=1e-3, atol=1e-9) & ~meant
     shares = at_limit.mean(axis=0)
-    at = [name for name, share in zip(task.model.input_names, shares, strict=True) if share > LIMITED]
+    at = [
+        name for name, share in zip(task.model.input_names, shares, strict=True) if share > LIMITED
+    ]
 
     # The largest error there, or else that at the end, as a share of what the target extends over.
     missed, errors = tracking_error(task, plan.made.predicted_run), []

@@ -297,7 +297,7 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
     at = [*([start.seconds] if start else []), log.first, *log.openings[:TRIED]]
     how: dict[str, Any] = {"logged": log.measured, "waits": log.waits}
     some = list[Story]()
-    for begins in dict.fromkeys(log.on_step(own.policy, one) for one in at):
+    for begins in dict.fromkeys(log.on_step(own.policy, one)[0] for one in at):
         if trial := log.trial_from(begins):
             run = trial.until(min(trial.finite_steps, task.horizon))
             some += stories(task, own, run, follows(own.policy, run, latest(task)), **how)

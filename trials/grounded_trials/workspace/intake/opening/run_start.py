@@ -21,6 +21,7 @@ candidate that ran reproduces the logged commands, mostly to the last digits.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -119,25 +120,21 @@ class Recording:
     def trial_from(self, start: float) -> Trial | None:
         """Return the log as a trial from `start` [s] on, or None if a state is not known there."""
         if start not in self._cut:
-            self._cut[start] = self._trial_from(start)
+            self._cut[start], span = None, Span(start=start)
+            with suppress(GroundedError):
+                cut = to_grid(
+                    self.series,
+                    self.dt,
+                    *self.names,
+                    span,
+                    angles=self.angles,
+                    steps=self.steps,
+                    past=self.past,
+                )
+                past = cut.start_inputs
+                run = Trial(cut.states, cut.inputs, self.dt, *self.names, start_inputs=past)
+                self._cut[start] = interpolate_gaps(run).trial if cut.late_s == 0 else None
         return self._cut[start]
-
-    def _trial_from(self, start: float) -> Trial | None:
-        span = Span(start=start)
-        try:
-            cut = to_grid(
-                self.series,
-                self.dt,
-                *self.names,
-                span,
-                angles=self.angles,
-                steps=self.steps,
-                past=self.past,
-            )
-        except GroundedError:
-            return None
-        run = Trial(cut.states, cut.inputs, self.dt, *self.names, start_inputs=cut.start_inputs)
-        return interpolate_gaps(run).trial if cut.late_s == 0 else None
 
     @property
     def openings(self) -> list[float]:
@@ -212,7 +209,7 @@ class Recording:
         while len(tried) < SOUGHT and np.isfinite(left).any() and policy.gain is not None:
             k = int(np.argmin(left))
             left[max(0, k - self.parts + 1) : k + self.parts] = np.inf
-            at, _ = self._on_step(policy, self.first + k * self.dt / self.parts)
+            at, _ = self.on_step(policy, self.first + k * self.dt / self.parts)
             tried[at] = off(at)
         best = min(tried, key=tried.__getitem__, default=0.0)
         if not tried or tried[best] > TO_DIGITS:
@@ -226,7 +223,7 @@ class Recording:
         step 0, each command is compared with the gains and reference of its neighbour, and may
         still look alike. The commands that were sent tell, with the input held before the others.
         """
-        first, _ = self._on_step(policy, self.first)
+        first, _ = self.on_step(policy, self.first)
         usual = acted_on(self, policy, found.seconds if found else first)
         if usual is not None and usual.exact:
             return None
@@ -243,7 +240,7 @@ class Recording:
         while len(found) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
             left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
-            on_step, room = self._on_step(policy, self.first + k * self.dt / self.parts)
+            on_step, room = self.on_step(policy, self.first + k * self.dt / self.parts)
             seconds, loose = self._between_rows(policy, on_step, room)
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
@@ -261,11 +258,7 @@ class Recording:
             return np.inf
         return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
 
-    def on_step(self, policy: Policy, start: float) -> float:
-        """Move a start by less than a step to where commands change [s]."""
-        return self._on_step(policy, start)[0]
-
-    def _on_step(self, policy: Policy, start: float) -> tuple[float, float]:
+    def on_step(self, policy: Policy, start: float) -> tuple[float, float]:
         """Move a start by less than a step to where commands change; return its uncertainty too."""
         dt, length = self.dt, self.dt * policy.horizon
         inside = (self.changes > start - dt / 2) & (self.changes < start + length)
@@ -367,14 +360,13 @@ def recording(
     every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
     interval = max(every, default=dt * 1e9) * 1e-9
     parts = 2 * int(np.clip(np.ceil(dt / max(interval, 1e-9) / 2 - 0.01), 1, FINEST / 2))
-    try:
-        whole = to_grid(series, dt / parts, *names, angles=model.angles)
-    except GroundedError:
-        series = {n: _bridged(one) if n in names[0] else one for n, one in series.items()}
-        try:
-            whole = to_grid(series, dt / parts, *names, angles=model.angles)
-        except GroundedError:
-            return None
+    bridged = {n: _bridged(one) if n in names[0] else one for n, one in series.items()}
+    for tried in (series, bridged):
+        with suppress(GroundedError):
+            whole, series = to_grid(tried, dt / parts, *names, angles=model.angles), tried
+            break
+    else:
+        return None
     sent = [series[name] for name in model.input_names]
     seen = [changes_of(s.t, s.values) for s in sent]
     at, late = (np.concatenate(x) for x in zip(*seen, strict=True))
