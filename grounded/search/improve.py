@@ -239,5 +239,5 @@ def _no_step(make: Maker, best: Tried, ending: Ending, **facts: float | None) ->
     """Return the ended search, with the steps from the best one that lost with this model."""
     own = best.candidate.id
     lost = len(losers_of(make.now.history, own, make.fingerprint)) or None
-    why = found("search.no_step", own, best=own, lost=lost, **facts)
+    why = found("search.no_step", own, best=own, lost=lost).also(**facts)
     return let_down(ended(make.now, ending, why), make.fingerprint)

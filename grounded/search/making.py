@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,7 +13,9 @@ from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
+from grounded.search.corrected import Corrected
 from grounded.search.feedback import between_limits, limit_cycle, planned_age, steadied
+from grounded.search.mispredictions import Believed, believed, believed_by_step
 from grounded.search.noise import beyond_noise
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
@@ -25,10 +26,6 @@ from grounded.solve.bias import Grounding, ground
 from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import Trial, mean_trial
-
-if TYPE_CHECKING:
-    from grounded.search.corrected import Corrected
-    from grounded.search.mispredictions import Alternative
 
 PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # precise enough for a direction
 GENTLER = 1e3  # factor on the input weights for each unit of caution
@@ -76,26 +73,19 @@ class About:
         plan.model.system.check(own.states[:-1], own.inputs, plan.model.values, plan.dt)
         self.grounding = ground(plan, own, match_inputs=options.match_inputs)
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
-        age = make.age
-        self.real = exact.on(replace(plan.problem(exact=True), age=age))
+        real = exact.on(replace(plan.problem(exact=True), age=make.age))
         self.theta = planner.widened(incumbent.candidate.policy)
         self.run = (own.states[:, : planner.task.model.n], own.inputs)
-        self.corrected: Corrected | None = None
-        self.missed = 0.0  # likely error of the model's movements, as a share of them
-        self.alternatives: tuple[Alternative, ...] = ()
-        self._known_costs: dict[Policy, float] = {}  # in the alternatives
+        found: Believed | None = None
         if way == BY_STEP:
-            from grounded.search.mispredictions import believed_by_step
-
-            if found := believed_by_step(planner, incumbent, make.now.history, self.real):
-                self.real, self.corrected = found.problem, found.corrected
-                self.missed = found.missed
+            found = believed_by_step(planner, incumbent, make.now.history, real)
         elif options.damps and len(make.now.history) > 1 and not self._kept():
-            from grounded.search.mispredictions import believed
-
-            found = believed(planner, incumbent, make.now.history, self.real)
-            self.alternatives = found.alternatives
-            self.real, self.corrected, self.missed = found.problem, found.corrected, found.missed
+            found = believed(planner, incumbent, make.now.history, real)
+        found = found or Believed(real)
+        self.real, self.corrected = found.problem, found.corrected
+        self.alternatives = found.alternatives
+        self.missed = found.missed  # likely error of the model's movements, as a share of them
+        self._known_costs: dict[Policy, float] = {}  # in the alternatives
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)

@@ -18,11 +18,7 @@ if TYPE_CHECKING:
 STEEP = 8.0  # ratio of worst to best utility from which on the axis is logarithmic
 MOST_DRAWN = 300  # most candidates that are drawn
 TICKS = 8  # most candidates named on an axis
-OPEN = {  # labels of undecided verdicts
-    "waiting": "waiting for its trial",
-    "in doubt": "in doubt",
-    "no trial": "without a trial",
-}
+OPEN = ("waiting", "in doubt", "no trial")  # undecided verdicts
 
 
 def search_figure(now: Standing) -> Figure | None:
@@ -38,7 +34,7 @@ def search_figure(now: Standing) -> Figure | None:
     key = [
         Key("best", f"first{', maybe better' * unsure} or better", "disc"),
         Key("other", "no better", "ring"),
-        *_undecided([now.verdict(t) for t in shown]),
+        *[Key("predicted", "undecided", "ring")] * any(now.verdict(t) in OPEN for t in shown),
         Key("predicted", "predicted by the model", "dash"),
         Key("best", "best so far"),
     ]
@@ -143,9 +139,3 @@ def _look(tried: Tried, verdict: str) -> tuple[str, str]:
     if verdict in OPEN:
         return "ring", "predicted"
     return ("disc", "best") if tried.accepted else ("ring", "other")
-
-
-def _undecided(verdicts: Sequence[str]) -> list[Key]:
-    """Return the legend entry for undecided candidates; empty if there are none."""
-    names = [words for verdict, words in OPEN.items() if verdict in verdicts]
-    return [Key("predicted", " or ".join(names), "ring")] if names else []

@@ -88,8 +88,6 @@ def too_strong(task: Task, candidate: Candidate) -> Finding | None:
     sent, fed = policy.input_names[j], policy.z_names[i]
     units = {**model.inputs, **model.states}
     of = units.get(fed, units[sent])  # else an input of an earlier step
-    known = fed in model.states
-    k = model.state_names.index(fed) if known else 0
     return found(
         "plan.gain",
         candidate.id,
@@ -99,8 +97,6 @@ def too_strong(task: Task, candidate: Candidate) -> Finding | None:
         gain=Quantity(abs(policy.gain[t, j, i]), f"{units[sent]} per {of}"),
         at=Quantity(t * task.dt, "s"),
         most=MAX_GAIN,
-        moved=Quantity(float(np.ptp(candidate.predicted_states[:, k])), of) if known else None,
-        state_weight=float(max(task.reward.state[k], task.reward.terminal[k])) if known else None,
         change=float(task.reward.input_change[j]),
     )
 

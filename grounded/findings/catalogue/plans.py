@@ -21,15 +21,12 @@ PLAN: dict[str, Entry] = {
     "outside": refuse(
         "[[{candidate}]][[!candidate? it]][[ (alpha = {alpha:.6g})]] takes {state} to {value}[[ "
         "at t = {at}]], outside [{table}] {state} = [{low}, {high}]",
-        "[[+- is the distance of trial {trial} from what it should repeat: if that run was "
-        "disturbed, remove it with `discard {trial}`]]",
     ),
     "gain": refuse(
         "the gain of {input} on {state} reaches {gain} in {candidate}, at t = {at}, more than "
-        "{most:.6g}[[; the plan moves {state} by {moved}]]",
-        "[[weigh {state} less in [reward] (now {state_weight:.3g}), or ]][[!state_weight? check "
-        "the unit of {state} and what it drives in the model, or ]]raise [reward] input_change of "
-        "{input} (now {change:.6g})",
+        "{most:.6g}",
+        "check the unit of {state} and what it drives in the model, weigh it less in [reward], or "
+        "raise [reward] input_change of {input} (now {change:.6g})",
     ),
     # what it is, what it promises, how far to trust it
     "made": note(
@@ -121,10 +118,10 @@ PLAN: dict[str, Entry] = {
         "name and unit",
     ),
     "delay_twice": refuse(
-        "{keys} {keys:removes/remove} from every log the delay that the adopted {effects} "
-        "{effects:has/have} in the model as well",
+        "{keys} {keys:removes/remove} from every log the delay that {effects} {effects:has/have} "
+        "in the model as well",
         "remove delay_s there again, so that plans allow for the delay that the robot's program "
-        "sees, or undo the adoption with `adopt --undo`",
+        "sees, or go without {effects} (`adopt --undo` undoes an adoption)",
     ),
     "other_task": refuse(
         "{about} was made for another task[[ ({what})]][[never? , and was not run there]]"
@@ -160,8 +157,9 @@ PLAN: dict[str, Entry] = {
     ),
     # a drive that excites the model's parameters
     "no_drive": refuse(
-        "[[!state? by the model, no drive stays inside [safety] from [task] start]][[state? "
-        "[safety] bounds no state, and no log shows where the robot may go]]",
+        "[[!state? by the model, no drive stays from [task] start where the robot may go, which "
+        "[safety] says, or else the logs]][[state? [safety] bounds no state, and no log shows "
+        "where the robot may go]]",
         "[[!state? start where there is room, make it shorter (--seconds), or widen "
         "[safety]]][[enter where it may go, such as [safety] {state} = [-1.0, 1.0]]]",
     ),

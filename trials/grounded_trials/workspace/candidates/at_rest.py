@@ -21,6 +21,7 @@ from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model, is_clock
 from grounded.places import integrals, rate_states
+from grounded.search.first_guess import trim
 from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
@@ -208,8 +209,6 @@ def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> A
         States and inputs (n + m,); None if the robot rests under the input held before already, or
         if no input holds it because the start is in motion.
     """
-    from grounded.search.first_guess import trim
-
     clocks = free & [is_clock(name) for name in task.model.state_names]
     free, away = free & ~clocks, np.abs(moved_at_start(task, task.past))[~clocks].max()
     if away <= STILL:

@@ -60,7 +60,7 @@ class Handed:
     @property
     def findings(self) -> tuple[Finding, ...]:
         """What is told of the candidate, the heaviest first."""
-        return settle(self.check.notes())
+        return settle(one for one in self.check.notes() if one)
 
 
 class Void(GroundedError):
@@ -233,22 +233,22 @@ class Check:
             yield found("plan.outdated", name, weight=Weight.REFUSE, candidate=name)
         yield from self._unsafe()
 
-    def notes(self) -> Iterator[Finding]:
+    def notes(self) -> Iterator[Finding | None]:
         """Yield what the user should know although it does not prevent its use."""
-        made, name = self.candidate, self.candidate.id
-        best, untried = self.standing.incumbent, not self._trials(name)
-        repeats = self.workspace.config.search.repeats
-        told = [
-            in_question(made, best, repeats) if best is not None and untried else None,
-            *self._became(),
-        ]
+        made, name, best = self.candidate, self.candidate.id, self.standing.incumbent
+        if best is not None and not self._trials(name):
+            yield in_question(made, best, self.workspace.config.search.repeats)
+        yield from self._became()
         if not self.same_task:
-            told.append(found("plan.other_task", name, weight=Weight.NOTE))
-        elif self._changed:
-            told.append(found("plan.outdated", name, candidate=name))
-        if self.same_task:
-            told.append(self._coasting())
-        yield from (one for one in told if one is not None)
+            yield found("plan.other_task", name, weight=Weight.NOTE)
+            return
+        if self._changed:
+            yield found("plan.outdated", name, candidate=name)
+
+        # Where the robot goes after the run, with the input held then.
+        planner, policy = self.workspace.planner, made.policy
+        held = np.clip(policy.past, policy.low, policy.high)
+        yield coasts_out(planner.task, planner.plan, planner.lift(made.predicted_run), held)
 
     def _became(self) -> Iterator[Finding]:
         """Yield that it lost, that its trials were set aside, or those that it was made from."""
@@ -271,13 +271,6 @@ class Check:
             if one.trial.candidate == name:
                 told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
                 yield told.also(why=aside[one.stored.id])
-
-    def _coasting(self) -> Finding | None:
-        """Return where the robot goes after the run, with the input held then."""
-        made, planner = self.candidate, self.workspace.planner
-        run = planner.lift(made.predicted_run)
-        held = np.clip(made.policy.past, made.policy.low, made.policy.high)
-        return coasts_out(self.workspace.task, planner.plan, run, held)
 
     @property
     def void(self) -> bool:

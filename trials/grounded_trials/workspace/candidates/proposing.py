@@ -15,7 +15,9 @@ from grounded.search.difference import in_question, last_gain
 from grounded.search.noise import known_noise, noise_cost, noise_missed
 from grounded.search.standing import Ending, Phase
 from grounded_trials.wording import rendered
+from grounded_trials.workspace.candidates import trust
 from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.workspace.candidates.first_plan import left_open
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,
@@ -158,15 +160,16 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
         notes = [one.also(instead=candidate.id) for one in notes]
     first: list[Finding] = []
     if not now.trials and (candidate is None or proposal.is_new):
-        from grounded_trials.workspace.candidates.first_plan import left_open
-
         first = left_open(workspace, proposal)
         notes += first
     asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)
-    lacks = _lacks(workspace, status.diagnosis) if candidate and status.diagnosis else None
-    unsure = now.doubt and Situation(workspace, now, status.diagnosis).doubted
-    notes += [one for one in (lacks, now.doubt if unsure else None) if one]
+    if candidate and status.diagnosis:
+        from grounded_trials.workspace.adoption import not_adopted
+
+        notes += [*filter(None, [not_adopted(workspace, status.diagnosis)])]
+    if now.doubt and Situation(workspace, now, status.diagnosis).doubted:
+        notes.append(now.doubt)
     if candidate is None:
         return _ended(workspace, proposal, status, notes, asked)
     return _told(workspace, proposal, notes, asked or to_run(workspace, candidate.id))
@@ -202,8 +205,6 @@ def _told(
     then: NextCommand,
 ) -> Proposed:
     """Return a candidate with what it promises and how far that can be trusted."""
-    from grounded_trials.workspace.candidates import trust
-
     made, now, task = proposal.candidate, proposal.standing, workspace.task
     assert made is not None
     same = [t for t in now.history if t.candidate.id == made.id]
@@ -318,12 +319,6 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         _adopted(workspace),
         much_noise(best.noise_cost, best.utility) if best else None,
     )
-
-
-def _lacks(workspace: Folder, diagnosis: Diagnosis) -> Finding | None:
-    from grounded_trials.workspace.adoption import not_adopted
-
-    return not_adopted(workspace, diagnosis)
 
 
 def _adopted(workspace: Folder) -> tuple[tuple[str, str], ...]:

@@ -251,8 +251,9 @@ class Stored:
             yield found("log.repeats", self.before, copy=others_differ(here))
         if self.aside:
             yield found("log.aside", self.id, waits=self.waits)
-        if read.before:
-            yield read.before.finding(used=not self.aside)
+        if was := read.before:
+            ran = was.trial.candidate or "data"
+            yield found("log.before", was.stored.id, ran=ran, used=not self.aside)
         if self.now and (changed := overtaken(here, ran=True)):
             yield changed.weighing(Weight.WARN)
         yield from _checked(here, trial, read.last_s)

@@ -18,6 +18,7 @@ from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
+from grounded.places import integrals
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.formats.text_tables import about_table
@@ -306,8 +307,6 @@ def _unmapped(
 
 def rates_of(model: Model) -> tuple[str, ...]:
     """Return the states that are velocities, which are zero while the robot is at rest."""
-    from grounded.places import integrals
-
     said = (model.roles.get("speed"), model.roles.get("heading_rate"))
     found = {model.state_names[one.j] for one in integrals(model)} | {*said}
     return tuple(name for name in model.state_names if name in found)
@@ -349,8 +348,8 @@ def read_log_file(
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(workspace, path, log.stored, "" if data else candidate)
     before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
-    if before and before.candidate in workspace.candidate_ids():
-        ran = before.candidate
+    if before and before.trial.candidate in workspace.candidate_ids():
+        ran = before.trial.candidate
     chosen = "" if data else ran or outstanding(workspace, path)
     if chosen:
         refuse_as_another(workspace, path, log.stored, chosen)

@@ -27,11 +27,9 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
     READ_BY,
+    StoredTrial,
     other_task,
     sha256,
-)
-from grounded_trials.workspace.intake.opening.stored_before import (
-    Aside,
 )
 
 if TYPE_CHECKING:
@@ -50,7 +48,9 @@ class Read:
     signals: tuple[SignalReport, ...] = ()
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
-    before: Aside | None = None  # the trial that was made from the log before and is set aside
+    before: StoredTrial | None = (
+        None  # the trial that was made from the log before and is set aside
+    )
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
     last_s: float = math.nan  # when all states of a foreign log were last known [s from the start]

@@ -7,16 +7,13 @@ that repeats the first with other numbers, which would invalidate any diagnosis.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from grounded.checks import refused
-from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, found
+from grounded.errors import NextCommand
 from grounded.search.standing import Phase
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_files import log_files, on_disk
@@ -63,28 +60,10 @@ def refuse_as_another(
     raise refused("log.stored", path, trial=identity, then=then, used=ran[-1] or "data", **facts)
 
 
-@dataclass(frozen=True)
-class Aside:
-    """A trial that was made from a log and is set aside."""
-
-    id: str
-    candidate: str  # "" for data
-
-    def finding(self, *, used: bool) -> Finding:
-        """Return that the log is used as before, or not."""
-        as_ = self.candidate or "data"
-        return found("log.before", self.id, ran=as_, used=used)
-
-
-def set_aside_of(workspace: Folder, digest: str) -> Aside | None:
+def set_aside_of(workspace: Folder, digest: str) -> StoredTrial | None:
     """Return the last trial, among those set aside, that was made from a log with this hash."""
-    aside = workspace.discarded()
-    for stored in reversed([one for one in workspace.store.list() if one.id in aside]):
-        with suppress(GroundedError):  # skip damaged files
-            trial, meta, _ = read_trial(workspace.store.read(stored))
-            if meta.get("source_sha256") == digest:
-                return Aside(stored.id, trial.candidate or "")
-    return None
+    made = [one for one in workspace.aside_trials() if one.meta.get("source_sha256") == digest]
+    return made[-1] if made else None
 
 
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
