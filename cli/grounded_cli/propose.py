@@ -10,7 +10,6 @@ from grounded_cli.console.terminal import (
     LABEL,
     field,
     next_line,
-    number,
     open_workspace,
     show,
     stages,
@@ -54,15 +53,12 @@ def tell_proposed(proposed: Proposed, *, details: bool = False) -> None:
 
 
 def show_extent(extent: Sequence[Extent]) -> None:
-    """Print where a predicted run goes: ranges of the main states and of inputs, the end."""
+    """Print where a predicted run goes: ranges of the main states and of inputs."""
     width = max([LABEL, *(len(one.name) for one in extent)])
     for one in extent:
         text = with_unit(_span(one.low, one.high), one.unit)
         if one.limits:
             text += f", limits {re.sub(r'[.]?0+(?= |$)', '', _span(*one.limits))}"
-        if math.isfinite(one.end):
-            aim = f" (target {number(one.aim)})" if math.isfinite(one.aim) else ""
-            text += f", at the end {number(one.end)}{aim}"
         show(field(one.name, text, "  ", width))
 
 

@@ -18,7 +18,6 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import missed_by_start
 from grounded.search.step_size import Step
 from grounded.task import Task
-from grounded_trials.workspace.off_target import reaches
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
@@ -26,8 +25,7 @@ if TYPE_CHECKING:
 
 LAST = 3  # recent predictions whose errors are told
 NOISE_SHARE = 0.2  # share of a cost above which its part due to sensor noise is told
-STATES = 3  # target states whose range is told; final values of models with 8 states at most
-ENDS = 8
+STATES = 3  # target states whose range is told
 
 
 @dataclass(frozen=True)
@@ -40,8 +38,6 @@ class Extent:
         low: least value.
         high: greatest value.
         limits: hard limits of an input that has them.
-        end: the last value, if the task has an aim at its end; else NaN.
-        aim: the target there; NaN for none.
     """
 
     name: str
@@ -49,20 +45,15 @@ class Extent:
     low: float
     high: float
     limits: tuple[float, float] | None = None
-    end: float = math.nan
-    aim: float = math.nan
 
 
 def extent_of(made: Candidate, task: Task) -> tuple[Extent, ...]:
     """Return where a predicted run goes: its main states, then its inputs."""
     model, rows = task.model, []
-    ends = (task.reward.terminal.any() or reaches(task)) and model.n <= ENDS
     main = _main_states(task)
-    for i, (name, unit) in enumerate(model.states.items()):
+    for (name, unit), values in zip(model.states.items(), made.predicted_states.T, strict=True):
         if name in main:
-            values, aim = made.predicted_states[:, i], float(task.target[-1, i])
-            last = (float(values[-1]), aim) if ends else ()
-            rows.append(Extent(name, unit, values.min(), values.max(), None, *last))
+            rows.append(Extent(name, unit, values.min(), values.max()))
     for j, (name, unit) in enumerate(model.inputs.items()):
         values, low, high = made.predicted_inputs[:, j], float(task.low[j]), float(task.high[j])
         limits = (low, high) if high < math.inf else None
