@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,13 +15,19 @@ import numpy as np
 
 from grounded.checks import unknown
 from grounded.errors import GroundedError
-from grounded.findings import found
+from grounded.findings import Finding, found
+from grounded.model import Model
 from grounded_trials.formats.message_path import parse_path
 from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import AS_IT_SAYS, LATEST, Layout
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
+from grounded_trials.logs.stated_units import LENGTHS, is_angle
 from grounded_trials.toml_table import Table
+
+PART = re.compile(r"((?:^|[._])(?:orientation|rotation|quaternion))\.([xyzw])$")
+ABOUT = {"x": "roll", "y": "pitch", "z": "yaw", "w": "yaw"}  # the angle closest to each component
+SMALL_ANGLE_SCALE = 2.0  # a scale of 2 is intended: 2 sin(a / 2) is a for small angles
 
 LATEST_S = 1e-9 * LATEST
 
@@ -219,3 +226,25 @@ def _with_row_before(series: Series) -> Series:
         values=np.concatenate([[raw], series.values]),
         log_times=np.concatenate([[logged], series.log_times]),
     )
+
+
+def misread(model: Model, mapping: LogMapping | None) -> list[Finding]:
+    """Return angles that are read from a part of a quaternion, and lengths from angles.
+
+    The data may not show it: the z of an orientation is sin(yaw / 2), as smooth as a yaw.
+
+    Args:
+        model: the model with the states.
+        mapping: the column of each signal; None if there is no [log].
+    """
+    some = []
+    for name, one in (mapping.states if mapping else {}).items():
+        unit, part = model.states.get(name, ""), PART.search(one.path)
+        angle = name in model.angles or unit in ("rad", "deg")
+        if unit in LENGTHS and is_angle(one.path) and one.scale == 1:
+            some.append(found("log.path", name, path=one.path, what="an angle"))
+        elif part and angle and abs(one.scale) != SMALL_ANGLE_SCALE:
+            instead = f"{one.path[: part.end(1)]}.@rpy.{ABOUT[part[2]]}"
+            what = "a part of a quaternion"
+            some.append(found("log.path", name, path=one.path, what=what, instead=instead))
+    return some

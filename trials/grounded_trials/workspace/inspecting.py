@@ -13,11 +13,10 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.log_table import layout_of
+from grounded_trials.logs.log_table import layout_of, misread
 from grounded_trials.plain_file import path_of
 from grounded_trials.store.own_files import CANDIDATE, TRIAL
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.user_files.config import FILE
 
 

@@ -16,10 +16,10 @@ from grounded import findings as said
 from grounded.accounts.finding import Finding, late_effects
 from grounded.trial import Trial
 from grounded_trials.logs.log_files import digest_of
+from grounded_trials.logs.log_table import misread
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
-from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.readings import UNCHANGED, Reading, readings_of
 
 

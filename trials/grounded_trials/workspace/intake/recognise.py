@@ -38,6 +38,7 @@ from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
+from grounded_trials.logs.log_table import misread
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
@@ -49,7 +50,6 @@ from grounded_trials.workspace.intake.look import (
     fall_in,
     sender_of,
 )
-from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.intake.opening.foreign import (
     cut_log,
     cut_short,

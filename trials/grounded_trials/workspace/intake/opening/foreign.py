@@ -24,7 +24,7 @@ from grounded.trial import Trial
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_files, log_records, read_apart
-from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals
+from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals, misread
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
@@ -36,7 +36,6 @@ from grounded_trials.workspace.identity import (
     ROWS,
     StoredTrial,
 )
-from grounded_trials.workspace.intake.opening.columns_by_name import misread
 from grounded_trials.workspace.intake.opening.estimating import (
     EstimateTable,
     read_estimate,
