@@ -48,48 +48,41 @@ def exported_as(workspace: Folder, name: str) -> str:
     return next((path.suffix[1:] for path in places if path.is_file()), "")
 
 
-def encoders() -> dict[str, Callable[[Policy, dict[str, str], dict[str, str]], bytes]]:
-    """Return the functions that write a policy, its units and its origin, by format."""
+def encoders() -> dict[str, Callable[[Policy, dict[str, Any]], bytes]]:
+    """Return the functions that write a policy, and what is said of it (`_said`), by format."""
     return {"csv": _csv, "json": _json, "npz": _npz}
 
 
-def about_of(identity: str, meta: Mapping[str, str]) -> dict[str, str]:
-    """Return what a file says of where it comes from."""
+def _said(
+    workspace: Folder, policy: Policy, identity: str, meta: Mapping[str, str]
+) -> dict[str, Any]:
+    """Return what each file says beside the policy's numbers: origin, law and units."""
     about = {"candidate": identity, "task": meta["task"], "model": meta["model"]}
-    return about | {"created_by": "grounded"}
+    model, law = workspace.base_model, OPEN_LOOP if policy.gain is None else LAW
+    units = {**model.states, **model.inputs}
+    return about | {"created_by": "grounded", "law": law, "units": units, "time_unit": "s"}
 
 
-def units_of(workspace: Folder) -> dict[str, str]:
-    """Return the units of the states and inputs."""
-    model = workspace.base_model
-    return {**model.states, **model.inputs}
-
-
-def _law(policy: Policy) -> str:
-    return OPEN_LOOP if policy.gain is None else LAW
-
-
-def _npz(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
+def _npz(policy: Policy, said: dict[str, Any]) -> bytes:
     stream = io.BytesIO()
-    texts = {"law": _law(policy), "units": json.dumps(units), "time_unit": "s", **about}
-    np.savez(stream, **to_arrays(policy, **texts))
+    np.savez(stream, **to_arrays(policy, **said | {"units": json.dumps(said["units"])}))
     return stream.getvalue()
 
 
-def _json(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
+def _json(policy: Policy, said: dict[str, Any]) -> bytes:
+    low, high = (
+        [v if np.isfinite(v) else None for v in end.tolist()] for end in (policy.low, policy.high)
+    )
     document: dict[str, Any] = {
-        "format": "grounded-policy-1",
-        **about,
-        "law": _law(policy),
+        "format": onboard.FORMAT,
+        **said,
         "dt": policy.dt,
-        "time_unit": "s",
-        "units": units,
         "state_names": policy.state_names,
         "input_names": policy.input_names,
         "z_names": policy.z_names,
-        "angles": [n for n, a in zip(policy.state_names, policy.angles, strict=True) if a],
-        "low": _limits(policy.low),
-        "high": _limits(policy.high),
+        "angles": _angles(policy),
+        "low": low,
+        "high": high,
         "past": policy.past.tolist(),
         "feedforward": policy.feedforward.tolist(),
     }
@@ -98,36 +91,31 @@ def _json(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
-def _limits(values: np.ndarray) -> list[float | None]:
-    return [float(v) if np.isfinite(v) else None for v in values]
+def _angles(policy: Policy) -> list[str]:
+    return [n for n, a in zip(policy.state_names, policy.angles, strict=True) if a]
 
 
-def _csv(policy: Policy, units: dict[str, str], about: dict[str, str]) -> bytes:
+def _csv(policy: Policy, said: dict[str, Any]) -> bytes:
     """Format one row per control step; lines that start with # have the law, units and limits."""
-    stream = io.StringIO()
-    stream.write("# format: grounded-policy-1\n")
-    for key, value in {**about, "law": _law(policy), "dt [s]": repr(policy.dt)}.items():
-        stream.write(f"# {key}: {value}\n")
-    stream.write(f"# units: {json.dumps(units)}\n")
-    stream.write(f"# z: {', '.join(policy.z_names)}\n")
-    angles = [n for n, a in zip(policy.state_names, policy.angles, strict=True) if a]
-    stream.write(f"# differences that wrap to [-pi, pi]: {', '.join(angles) or 'none'}\n")
-    for name, low, high, held in zip(
-        policy.input_names, policy.low, policy.high, policy.past, strict=True
-    ):
-        span = f"[{float(low)!r}, {float(high)!r}]"
-        stream.write(f"# {name}: limits {span}, held before the start {float(held)!r}\n")
+    head = {"format": onboard.FORMAT, **said, "dt [s]": repr(policy.dt)}
+    head |= {"units": json.dumps(head.pop("units")), "z": ", ".join(policy.z_names)}
+    head["differences that wrap to [-pi, pi]"] = ", ".join(_angles(policy)) or "none"
+    lines = [*head.items()]
+    ends = np.stack([policy.low, policy.high, policy.past], axis=1).tolist()
+    for name, (low, high, held) in zip(policy.input_names, ends, strict=True):
+        lines.append((name, f"limits [{low!r}, {high!r}], held before the start {held!r}"))
     columns = [policy.feedforward]
     header = ["t", *(f"feedforward.{name}" for name in policy.input_names)]
     if policy.gain is not None and policy.reference is not None:
         columns += [policy.reference, policy.gain.reshape(policy.horizon, -1)]
         header += [f"reference.{z}" for z in policy.z_names]
         header += [f"gain.{u}.{z}" for u in policy.input_names for z in policy.z_names]
-    values = np.hstack(columns)
+    stream = io.StringIO()
+    stream.writelines(f"# {key}: {value}\n" for key, value in lines)
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(header)
-    for step, row in enumerate(values):
-        writer.writerow([f"{step * policy.dt:.10g}", *(repr(float(v)) for v in row)])
+    for step, row in enumerate(np.hstack(columns).tolist()):
+        writer.writerow([f"{step * policy.dt:.10g}", *map(repr, row)])
     return stream.getvalue().encode()
 
 
@@ -255,13 +243,13 @@ def export_candidate(
     now = standing_in(workspace) if identity == "best" else None
     identity = candidate_named(workspace, identity, now)
     handed = checked_candidate(workspace, identity, anyway=anyway, other_task=True, now=now)
-    about = about_of(identity, handed.meta)
     if form == "npz":
         try:
             onboard.check_limits(identity, handed.candidate.policy)
         except ValueError as error:
             raise refused("plan.refused", identity, why=str(error)) from None
-    write_atomically(path, known[form](handed.candidate.policy, units_of(workspace), about))
+    policy = handed.candidate.policy
+    write_atomically(path, known[form](policy, _said(workspace, policy, identity, handed.meta)))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
