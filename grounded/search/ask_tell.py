@@ -215,21 +215,17 @@ class Search:
                 or dt differ from the task's.
         """
         self._add(trial)
+        self._check_last(refuse=False)
+
+    def _check_last(self, *, refuse: bool) -> None:
+        """Warn of what is wrong with the last trial, or forget and refuse one that is odd."""
         trial = self._trials[-1]
-        if odd := self._odd():
-            warnings.warn(f"{trial.candidate}: {odd.what}", stacklevel=2)
-        elif crash := crashed(self.task, trial):
-            warnings.warn(f"{trial.candidate}: {crash.what}", stacklevel=2)
-
-    def _odd(self) -> Finding | None:
-        """Return what is wrong with the last trial, if anything is."""
-        first = len(self._trials) == 1
-        return odd_trial(self.task, self._candidates, self._trials[-1], first=first)
-
-    def _forget_last(self) -> None:
-        """Forget the last trial."""
-        del self._trials[-1]
-        self._planned = None
+        odd = odd_trial(self.task, self._candidates, trial, first=len(self._trials) == 1)
+        if odd and refuse:
+            del self._trials[-1]
+            raise TrialRefused(odd, self)
+        if why := odd or crashed(self.task, trial):
+            warnings.warn(f"{trial.candidate}: {why.what}", stacklevel=3)
 
     def _add(self, trial: Trial) -> None:
         ids = [c.id for c in self._candidates]
@@ -284,12 +280,8 @@ def learn(
         candidate = search.ask()
         assert candidate is not None
         search._add(replace(_run(run, candidate), candidate=candidate.id))
-        trial = search.trials[-1]
-        if check and (odd := search._odd()):
-            search._forget_last()
-            raise TrialRefused(odd, search)
-        if check and (crash := crashed(task, trial)):
-            warnings.warn(f"{trial.candidate}: {crash.what}", stacklevel=2)
+        if check:
+            search._check_last(refuse=True)
 
 
 def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:

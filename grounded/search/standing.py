@@ -377,14 +377,6 @@ def _hardly(
     )
 
 
-def _due(tried: Tried, best: Tried) -> float:
-    """Return the part of a loss to the best one that the start states explain by the model."""
-    if tried.starts is None or not (tried.trials and best.trials):
-        return 0.0
-    owed = tried.starts.owed(tried, best)
-    return max(-owed, 0.0) if math.isfinite(owed) else 0.0
-
-
 def let_down(now: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if the model promises much that it lacks.
 
@@ -404,7 +396,7 @@ def let_down(now: Standing, model: str) -> Standing:
         if made.of_model_alone and made.model == model:
             short = gain = tried.promised - best.utility - missed_by_start(best)
         elif made in lost and not made.doubtful:
-            loss, gain = best.utility - tried.utility - _due(tried, best), made.predicted_gain
+            loss, gain = -tried.gain_over(best), made.predicted_gain
             short = min(loss + gain, max(loss, gain))
         else:
             continue
