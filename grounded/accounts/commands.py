@@ -100,11 +100,7 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
         }
         k = min(fits, key=lambda k: fits[k].score)
         # all that past and present commands can do
-        before = min(
-            ahead.best([ones, 0.0 * ones]),
-            ahead.whatever_commands_do().best([ones]),
-            key=lambda fit: fit.score,
-        )
+        before = ahead.whatever_commands_do().best([ones])
     parts, gain = fits[k].rms / before.rms, before.score - fits[k].score
     if gain < MARGIN or parts.min() > HALF_ERROR:
         return None

@@ -395,8 +395,6 @@ def _compared(
     if (size > (abs(np.log(account.factor)) / 3 if unit else np.log(LIKE))).any():
         return None  # the inputs act otherwise than in the model
     after = mended.best([ones], free=False) if unit else free
-    if mended.still().missed - after.missed < (HINT if unit else MARGIN):
-        return None  # commands explain nothing
     if unit:
         before = logged.best([ones], free=False)
     else:

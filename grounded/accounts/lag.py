@@ -5,8 +5,7 @@ difference: the noise adds the same to the difference at every shift. The window
 standard deviation of d is used; the spread over the other windows is added to it. The scale is only
 bounded from both sides (Frisch): noise in a makes <a b> / <a a> too small, noise in b makes
 <b b> / <a b> too large. A first-order filter is distinguished from a delay by a = b + tau b'. It is
-chosen if it fits better than any delay, or as well and without a difference in scale, since the
-attenuation of fast motion by a filter looks like a scale error beside a delay.
+chosen if it fits better than any delay.
 """
 
 from __future__ import annotations
@@ -29,7 +28,7 @@ BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertain
 REPORTED_FROM = 5.0  # standard deviations above which a delay or a bias is reported
 SAME = 0.01  # scale error that matters
 SURELY = 3.0  # standard deviations by which the scale must be certain
-FILTER, PLAIN = 0.9, 1 / 3  # of a delay's misfit, and of its scale: what a filter leaves
+FILTER = 0.9  # of a delay's misfit: what a filter leaves
 
 
 @dataclass(frozen=True)
@@ -168,7 +167,7 @@ def _measured(pieces: _Pieces, dt: float) -> Lag | None:
             break
     rest, pull = a - s * b, s * slope
     std = pieces.scatter(rest * pull) / max(_dot(pull, pull), 1e-300)
-    behind = _filter(pieces, a, _dot(rest, rest), s) if d > 0 else None
+    behind = _filter(pieces, a, _dot(rest, rest)) if d > 0 else None
     if behind is not None:
         d, b = behind  # the scale is that of the filter's input
         s = _dot(a, b) / max(_dot(b, b), 1e-300)
@@ -184,15 +183,14 @@ def _dot(a: Array, b: Array) -> float:
     return float((a * b).sum())  # on one thread
 
 
-def _filter(pieces: _Pieces, a: Array, misfit: float, scale: float) -> tuple[float, Array] | None:
+def _filter(pieces: _Pieces, a: Array, misfit: float) -> tuple[float, Array] | None:
     """Return tau [samples] and b + tau b' if a = s (b + tau b') fits better than a scaled delay."""
     b, slope = pieces.moved(0.0), 0.5 * (pieces.moved(1.0) - pieces.moved(-1.0))
     columns = np.stack([b, slope], axis=1)
     s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
     rest = float(((a - columns @ [s, both]) ** 2).sum())
-    off, plain = (abs(np.log(max(abs(size), 1e-300))) for size in (scale, s))
-    better = rest < (1 / FILTER if plain < PLAIN * off else FILTER) * misfit
-    return (float(both / s), b + both / s * slope) if better and both / s > 0 else None
+    better = rest < FILTER * misfit and both / s > 0
+    return (float(both / s), b + both / s * slope) if better else None
 
 
 def at_samples(x: Array, at: Any) -> Array:

@@ -10,6 +10,7 @@ commands is removed as well.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 
 import numpy as np
@@ -171,7 +172,7 @@ class Ahead:
         spans = [(-h, 0), (0, half)] + ([(half, h)] if half < h else [])
         starts = [np.maximum(self.at + a, 0) for a, _ in spans]
         told = [sums[self.at + b] - sums[a] for a, (_, b) in zip(starts, spans, strict=True)]
-        other = self._with(self.sent)
+        other = copy(self)
         other.left_out = basis(np.hstack([self.left_out, *told]))
         return other
 
@@ -189,11 +190,6 @@ class Ahead:
         off = self._off(gains, self.model.values, late)
         return np.array([np.log(self.size(one)).sum() for one in off])
 
-    def still(self) -> Fit:
-        """Return the calibrated fit with every command at its mean: the commands have no effect."""
-        mean = np.broadcast_to(self.sent.mean(axis=0), self.sent.shape)
-        return self._with(mean)._fitted(np.ones(self.model.m), 0, free=False)
-
     def best(self, starts: Sequence[Array], *, free: bool = True, late: int | None = None) -> Fit:
         """Return the best fit over several initial gains, each with its best delay.
 
@@ -208,11 +204,6 @@ class Ahead:
             for gains in starts
         ]
         return min(fits, key=lambda fit: fit.score)
-
-    def _with(self, sent: Array) -> Ahead:
-        other = object.__new__(Ahead)
-        other.__dict__.update(self.__dict__ | {"sent": sent})
-        return other
 
     def _fitted(self, gains: Array, late: int, *, free: bool) -> Fit:
         """Fit gains (if free) and parameters by Gauss-Newton, each state weighted by its error."""
