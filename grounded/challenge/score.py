@@ -13,6 +13,7 @@ interval.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -116,6 +117,7 @@ def judge(
     for g in diagnosis["indistinguishable"]:
         if order and order[0] in g:
             group |= set(g[:3])
+    clear = bool(diagnosis["leftover"]) or (diagnosis["gap"]["after"] or 0.0) <= LEAVES
     marks: dict[str, Any] = {
         "case": label["case"],
         "kind": label["kind"],
@@ -128,11 +130,11 @@ def judge(
         "both": set(truth) <= set(named),
         "both_in_group": _matched(truth, named, diagnosis["indistinguishable"]),
         "leftover": bool(diagnosis["leftover"]),
-        "gap_after": diagnosis["gap"]["after"],
         "system": label["system"],
         "false_effect": not truth and bool(_physical(named, label)),
         "false_second": bool(truth) and _spare(truth, named, label) > 0,
         "covered": _covered(label, diagnosis),
+        "misleading": not truth and bool(_physical(named, label)) and not clear,
         "worse": bool(named) and _ratio(diagnosis, _without(diagnosis)) > WORSE,
     }
     if known is not None:
@@ -211,63 +213,46 @@ def _covered(label: Mapping[str, Any], diagnosis: Mapping[str, Any]) -> list[boo
     return found
 
 
+SHARES = {  # of the cases of a kind: figure -> (mark, the mark of the cases that count, "" for all)
+    "single": {
+        "first": ("first", "detectable"),
+        "in_group": ("in_group", "detectable"),
+        "false_second": ("false_second", ""),
+    },
+    "double": {
+        "both": ("both", "each_detectable"),
+        "both_in_group": ("both_in_group", "each_detectable"),
+        "false_second": ("false_second", ""),
+    },
+    "none": {"leftover": ("leftover", "")},
+    "withheld": {
+        "misleading": ("misleading", ""),
+        "claimed": ("false_effect", ""),
+        "leftover": ("leftover", ""),
+    },
+}
+
+
 def summary(marks: Marks) -> dict[str, Any]:
     """Return summary figures of a set of marked cases, by kind."""
     found: dict[str, Any] = {}
     for kind in sorted({m["kind"] for m in marks}):
         some = [m for m in marks if m["kind"] == kind]
-        row: dict[str, Any] = {"cases": len(some)}
-        row["verdicts"] = {
-            v: sum(m["verdict"] == v for m in some)
-            for v in ("effect", "several", "none", "unknown")
-        }
-        row["worse"] = _part(some, "worse")
-        row |= OF_KIND[kind](some)
+        verdicts = dict.fromkeys(("effect", "several", "none", "unknown"), 0)
+        verdicts |= Counter(m["verdict"] for m in some)
+        row: dict[str, Any] = {"cases": len(some), "verdicts": verdicts}
+        row["worse"] = share(m["worse"] for m in some)
+        if kind == "none":
+            by = {
+                n: [m for m in some if m["noise"] == n] for n in sorted({m["noise"] for m in some})
+            }
+            row["false"] = {n: share(m["false_effect"] for m in own) for n, own in by.items()}
+        for name, (mark, only) in SHARES[kind].items():
+            row[name] = share(m[mark] for m in some if not only or m.get(only))
+        if kind in ("single", "double"):  # intervals that hold
+            row["coverage"] = share(c for m in some for c in m["covered"])
         found[kind] = row
     return found
-
-
-def _single(some: Marks) -> dict[str, Any]:
-    seen = [m for m in some if m.get("detectable")]
-    return {
-        "first": _part(seen, "first"),
-        "in_group": _part(seen, "in_group"),
-        **_of_effects(some),
-    }
-
-
-def _double(some: Marks) -> dict[str, Any]:
-    seen = [m for m in some if m.get("each_detectable")]
-    both = {key: _part(seen, key) for key in ("both", "both_in_group")}
-    return {**both, **_of_effects(some)}
-
-
-def _of_effects(some: Marks) -> dict[str, Any]:
-    """Return figures for cases with effects: false names, and intervals that hold."""
-    covered = share(c for m in some for c in m["covered"])
-    return {"false_second": _part(some, "false_second"), "coverage": covered}
-
-
-def _none(some: Marks) -> dict[str, Any]:
-    kinds = sorted({m["noise"] for m in some})
-    by = {n: _part([m for m in some if m["noise"] == n], "false_effect") for n in kinds}
-    return {"false": by, "leftover": _part(some, "leftover")}
-
-
-def _withheld(some: Marks) -> dict[str, Any]:
-    bad = (m["false_effect"] and m["gap_after"] > LEAVES and not m["leftover"] for m in some)
-    return {
-        "misleading": share(bad),
-        "claimed": _part(some, "false_effect"),
-        "leftover": _part(some, "leftover"),
-    }
-
-
-OF_KIND = {"single": _single, "double": _double, "none": _none, "withheld": _withheld}
-
-
-def _part(marks: Marks, key: str) -> dict[str, Any]:
-    return share(bool(m[key]) for m in marks)
 
 
 def share(said: Iterable[bool]) -> dict[str, Any]:

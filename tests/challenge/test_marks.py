@@ -110,25 +110,36 @@ def test_without_mujoco_its_systems_are_refused(tmp_path, monkeypatch):
     assert alone.code == 1 and "mujoco" in alone.err
 
 
-def marks_of(truth, named, *, errors=(1.0, 1.0), kind="single", param_error=0.0, known=None):
-    label = {"effects": [{"effect": truth, "params": {}}] if truth else [], "case": "x"}
+def marks_of(truth, named, *, kind="single", param_error=0.0, known=None, **document):
+    """Return the marks of names, beside true effects: a name, several with their values, or ""."""
+    true = {truth: {}} if isinstance(truth, str) else truth
+    label = {"effects": [{"effect": e, "params": p} for e, p in true.items() if e], "case": "x"}
     label |= {"kind": kind, "noise": "white", "system": "car", "param_error": param_error}
-    row = {"whole_trial": False, "crude": {"v": errors[0]}, "with_effects": {"v": errors[1]}}
+    row = {"whole_trial": False, "crude": {"v": 1.0}, "with_effects": {"v": 1.0}}
     found = {"verdict": {"kind": "effect", "effects": named}, "indistinguishable": []}
     found["ranking"] = [{"effect": n, "params": {}, "claimed": True} for n in named]
     found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": [row]}
-    return judge(label, found, known)
+    return judge(label, found | document, known)
 
 
 def test_a_value_whose_uncertainty_is_unknown_covers_nothing():
-    label = {"effects": [{"effect": "patch:a", "params": {"c": 2.0, "x0": 1.0}}], "case": "x"}
-    label |= {"kind": "single", "noise": "white", "system": "car", "param_error": 0.0}
-    row = {"whole_trial": False, "crude": {"v": 1.0}, "with_effects": {"v": 0.5}}
     params = {"c": {"value": 3.0, "std": None}, "x0": {"value": 1.1, "interval": [0.9, 1.3]}}
-    found = {"verdict": {"kind": "effect", "effects": ["patch:a"]}, "indistinguishable": []}
-    found["ranking"] = [{"effect": "patch:a", "params": params, "claimed": True}]
-    found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": [row]}
-    assert judge(label, found, None)["covered"] == [True]
+    ranking = [{"effect": "patch:a", "params": params, "claimed": True}]
+    marks = marks_of({"patch:a": {"c": 2.0, "x0": 1.0}}, ["patch:a"], ranking=ranking)
+    assert marks["covered"] == [True]
+
+
+@pytest.mark.parametrize(
+    ("after", "leftover", "misleads"), [(2.0, [], 1), (1.0, [], 0), (2.0, [{}], 0), (None, [], 0)]
+)
+def test_a_name_for_what_the_library_lacks_misleads_where_a_gap_is_not_told(
+    after, leftover, misleads
+):
+    document = {"gap": {"after": after}, "leftover": leftover}
+    marks = marks_of("", ["delay:a"], kind="withheld", **document)
+    row = summary([marks, marks_of("", [], kind="withheld")])["withheld"]
+    assert (row["misleading"]["count"], row["claimed"]["count"]) == (misleads, 1)
+    assert row["leftover"]["count"] == len(leftover) and row["verdicts"]["effect"] == 2
 
 
 def test_a_second_name_that_nothing_makes_is_counted():
@@ -141,12 +152,8 @@ def test_a_second_name_that_nothing_makes_is_counted():
 
 
 def test_what_is_likeliest_and_not_named_is_not_first():
-    label = {"effects": [{"effect": "delay:a", "params": {}}], "case": "x", "kind": "single"}
-    label |= {"noise": "white", "system": "car", "param_error": 0.0}
-    found = {"verdict": {"kind": "none", "effects": []}, "indistinguishable": []}
-    found |= {"gap": {"after": 1.0}, "leftover": [], "prediction_error": []}
-    found["ranking"] = [{"effect": "delay:a", "params": {}, "claimed": False}]
-    marks = judge(label, found, None)
+    ranking = [{"effect": "delay:a", "params": {}, "claimed": False}]
+    marks = marks_of("delay:a", [], ranking=ranking)
     assert not (marks["first"] or marks["in_group"])
 
 
@@ -188,11 +195,9 @@ def test_shares_have_the_interval_of_wilson():
 
 def test_parameters_that_the_sentence_calls_off_and_ties_count_for_both_of_a_double():
     def both(named, ties=(), off=()):
-        label = {"effects": [{"effect": n, "params": {}} for n in ("delay:a", "parameter:L")]}
-        label |= {"case": "x", "kind": "double", "noise": "white", "system": "car"}
-        found = {"verdict": {"kind": "several", "effects": named, "parameters": off}}
-        found |= {"ranking": [], "indistinguishable": ties, "gap": {"after": 1.0}, "leftover": []}
-        marks = judge(label | {"param_error": 0.0}, found, None)
+        verdict = {"kind": "several", "effects": named, "parameters": off}
+        document = {"verdict": verdict, "indistinguishable": ties, "ranking": []}
+        marks = marks_of({"delay:a": {}, "parameter:L": {}}, [], kind="double", **document)
         return marks["both"], marks["both_in_group"], marks["false_second"]
 
     assert both(["delay:a"], off=["L"]) == (True, True, False)
