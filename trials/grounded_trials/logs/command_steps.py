@@ -27,11 +27,6 @@ MOVED = 0.05  # of a step: a start nearer to a change than this is not moved
 HELD = 0.5  # share of repeated rows above which rows are not written at changes of commands
 STEADY_S, STEADY_STEPS = 0.25, 4  # commands are steady if constant for both times
 LOOK_S, LOOK = 3.0, 0.2  # the steady moment is sought within this time and share of a log
-STILL_S = 0.2  # [s] shortest standstill
-REST_RANGE, REST_NOISE = (
-    2e-3,
-    4.0,
-)  # at rest: within this share of its range, and this multiple of its noise
 
 
 def phase_of(
@@ -147,27 +142,6 @@ def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:
     """Check whether a table starts with commands that are not those of rest."""
     rows = any(held_rows(s.t, s.y) > 0 for s in inputs)
     return rows and any(s.before(start) != u for s, u in zip(inputs, rest, strict=True))
-
-
-def stands_still(states: Sequence[Samples], rates: Sequence[str], until: int) -> bool:
-    """Check whether a robot was recorded at rest before its first command.
-
-    Args:
-        states: the measured states; none may drift, and velocities must be zero.
-        rates: names of the states that are velocities.
-        until: time of the first command [ns].
-    """
-    for one in states:
-        y = one.y[one.t < until]
-        if len(y) < 2 * FEW_CHANGES or (until - one.t[0]) * 1e-9 < STILL_S:
-            return False
-        change, half = np.diff(y), len(y) // 2
-        noise = float(np.sqrt((change**2).mean() / 2)) + REST_RANGE * float(np.ptp(one.y))
-        drift = abs(float(y[half:].mean() - y[:half].mean()))
-        off = abs(float(y.mean())) if one.name in rates else 0.0
-        if max(drift, off) > REST_NOISE * noise or np.ptp(y) > 2 * REST_NOISE * noise:
-            return False
-    return bool(states)
 
 
 def _steady(inputs: Sequence[Samples], changes: Ints, start: int, moved: int, dt: float) -> int:

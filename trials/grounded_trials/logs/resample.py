@@ -28,9 +28,8 @@ from grounded_trials.logs.command_steps import (
     first_step,
     in_motion,
     rows_apart,
-    stands_still,
 )
-from grounded_trials.logs.samples import REGULAR, How, Samples, check_overlap, tidy
+from grounded_trials.logs.samples import REGULAR, How, Lead, Samples, at_rest, check_overlap, tidy
 from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
@@ -199,7 +198,7 @@ def to_grid(
         inputs=np.column_stack([values[name] for name in inputs]),
         start_inputs=held,
         assumed=assumed,
-        start_states=_start_states(tracked, rates, start),
+        start_states=_start_states({one.name: one.leading_to(start) for one in tracked}, rates),
         start_ns=start,
         origin_ns=origin,
         late_s=late,
@@ -239,7 +238,7 @@ class _Commands:
             sent = [one.held_from(before, u) if wait else one for one, u, wait in three]
         if rest is None:
             return cls(sent, 0, "hold", False)
-        still = stands_still(tracked, rates, start)
+        still = at_rest({one.name: one.leading_to(start) for one in tracked}, rates)
         moved, in_steps = first_step(sent, start, dt, not still and in_motion(sent, start, rest))
         return cls(sent, moved, "hold" if in_steps else "mean", still)
 
@@ -273,16 +272,13 @@ def begins_early(samples: Samples, grid: Ints) -> float:
     return float(np.sqrt(np.mean((f * (1 - f) * h) ** 2) / 2))
 
 
-def _start_states(states: Sequence[Samples], rates: Sequence[str], start: int) -> dict[str, float]:
+def _start_states(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> dict[str, float]:
     """Return the values at t = 0 as the samples before tell, for the states of which they do.
 
-    That is their mean if no state moves and no velocity is off zero, else, or without a velocity,
-    where a line leads: a boat that drifts is not where it was on average.
+    That is their mean at rest, else, or without a velocity, where a line leads: a boat that drifts
+    is not where it was on average.
     """
-    leads = {one.name: one.leading_to(start) for one in states}
-    still = bool(rates) and all(
-        one and not one.moves and not (one.off and name in rates) for name, one in leads.items()
-    )
+    still = bool(rates) and at_rest(leads, rates)
     return {name: one.mean if still else one.line for name, one in leads.items() if one}
 
 

@@ -7,7 +7,7 @@ max_age_s the value is unknown.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
@@ -21,12 +21,10 @@ from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.signals import Series, SignalSpec
 
 GAP_INTERVALS, GAP_STEPS, GAP_S = 5.0, 3.0, 0.1  # without max_age_s a gap exceeds all of these
-STILL_S, FEWEST = 1.0, 8  # [s] before a time from which samples tell the value there; how many
-# Largest scatter about a line, by a sample's noise: as noise alone has it by chance (`_by_chance`),
-# within these. Largest std of the line's end, by a sample's noise.
-WHITE, BETTER = (1.3, 1.6), 0.7
-OFF, SURE = 4.0, 3.0  # std by which the value itself may differ, and from which a motion shows
-JUMP = 0.9  # share of the squares of all steps from which a single one is a jump, and no noise
+BEFORE_S, FEWEST = 1.0, 8  # [s] before a time from which samples tell the value there; how many
+QUANTUM = 2e-3  # of a signal's range: the least noise of its samples
+STRAIGHT = 1.5  # largest scatter about a line, by a sample's noise
+SURE = 3.0  # standard deviations from which a motion, or another value, is no noise
 JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
 MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
@@ -164,24 +162,19 @@ class Samples:
         """Return what the samples of the second before a time [ns] say of the value there.
 
         None if that is no better than the sample there: with few samples, or if these scatter more
-        about a straight line than from one to the next, as those of a robot that moves do. What was
-        before a jump, as of a simulator that was reset, says nothing.
+        about a straight line than from one to the next, as those of a robot that moves do.
         """
-        before = (self.t <= at) & (self.t > at - round(STILL_S * 1e9))
+        before = (self.t <= at) & (self.t > at - round(BEFORE_S * 1e9))
         t, y = 1e-9 * (self.t[before] - at), self.y[before]
-        while len(y) >= FEWEST and (steps := np.diff(y) ** 2).max() > JUMP * steps.sum():
-            t, y = t[steps.argmax() + 1 :], y[steps.argmax() + 1 :]
         if len(y) < FEWEST:
             return None
         tilt, level = np.polyfit(t, y, 1)
-        noise = float(np.sqrt((np.diff(y) ** 2).mean() / 2))
+        noise = float(np.sqrt((np.diff(y) ** 2).mean() / 2)) + QUANTUM * float(np.ptp(self.y))
         scatter = float(np.sqrt(((y - level - tilt * t) ** 2).sum() / (len(y) - 2)))
-        spread = float(((t - t.mean()) ** 2).sum())
-        end = float(np.sqrt(1 / len(y) + t.mean() ** 2 / spread))
         there = self.y[min(int(np.searchsorted(self.t, at)), len(self.t) - 1)]
-        if scatter > _by_chance(len(y)) * noise or end > BETTER or abs(there - level) > OFF * noise:
+        if scatter > STRAIGHT * noise or abs(there - level) > SURE * noise:
             return None
-        moves, mean = abs(tilt) * spread**0.5 > SURE * noise, float(y.mean())
+        moves, mean = abs(tilt) * t.std() * len(y) ** 0.5 > SURE * noise, float(y.mean())
         return Lead(float(level), mean, bool(moves), abs(mean) > SURE * noise / len(y) ** 0.5)
 
     def held_from(self, at: int, value: float) -> Samples:
@@ -227,13 +220,11 @@ class Samples:
         raise GroundedError(found("file.gap", self.name, path=self.spec.path, **facts))
 
 
-def _by_chance(count: int) -> float:
-    """Return the largest ratio of white noise's scatter to that from its differences, by chance.
-
-    The variance of the ratio's square is (n - 2) / (n^2 - 1) (von Neumann 1941).
-    """
-    least = 1 - SURE * np.sqrt((count - 2) / (count**2 - 1))
-    return float(np.clip(max(least, 1e-9) ** -0.5, *WHITE))
+def at_rest(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> bool:
+    """Return whether samples before a time show that no state moves, and no velocity is off 0."""
+    return bool(leads) and all(
+        one and not (one.moves or (one.off and n in rates)) for n, one in leads.items()
+    )
 
 
 TIDIED: WeakKeyDictionary[Series, dict[tuple[str, bool], Samples]] = WeakKeyDictionary()

@@ -30,9 +30,8 @@ from grounded.model import Model
 from grounded.places import probe, rate_states
 from grounded.task import Task
 from grounded_trials.formats.messages import Ints
-from grounded_trials.logs.command_steps import stands_still
 from grounded_trials.logs.resample import stamped_otherwise
-from grounded_trials.logs.samples import Samples, check_overlap, tidy
+from grounded_trials.logs.samples import Samples, at_rest, check_overlap, tidy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.toml_table import Table
 
@@ -131,7 +130,7 @@ def _at_rest(samples: Sequence[Samples], sent: Sequence[Samples], model: Model) 
     """
     moved = [s.t[1:][np.diff(s.y) != 0] for s in sent]
     until = min((int(t[0]) for t in moved if len(t)), default=0)
-    if not stands_still(samples, (), until):
+    if not at_rest({one.name: one.leading_to(until) for one in samples}, ()):
         return {}
     own = {s.name for s in samples}
     return {rate: until for place, rate in rate_states(model).items() if place in own}
