@@ -109,18 +109,3 @@ def test_a_table_in_degrees_is_told(w, tmp_path, end, told):
     (table := tmp_path / "mine.csv").write_text("t,theta\n" + rows)
     done = grounded("-C", w.folder, "target", table, "--json").json
     assert ("start.degrees" in {one["code"] for one in done["findings"]}) == told
-
-
-def test_a_target_that_was_drawn_in_readings_of_a_biased_sensor_is_told(w):
-    text = w.config.file.read_text()
-    bias = 'effects = [{ name = "sensor_bias:theta", b = 0.2 }]'
-    w.config.file.write_text(text.replace("[model]", f"[model]\n{bias}"))
-
-    def told(end):
-        drawn = grounded("-C", w.folder, "target", "step", "--to", f"theta={end}", "--json").json
-        codes = {one["code"]: one for one in drawn["findings"]}
-        return codes.get("target.readings")
-
-    found = told(1.0)
-    assert found["about"] == ["theta"] and found["facts"]["end"]["value"] == 1.0
-    assert told(0.2) is None  # it ends where the sensor shows 0

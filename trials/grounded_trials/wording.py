@@ -100,11 +100,6 @@ def labelled(name: str, unit: str) -> str:
     return f"{name} [{unit}]" if shown(unit) else name
 
 
-def misread(bias: float, unit: str) -> str:
-    """Return by how much a biased sensor reads wrong: `0.0044 rad too high`."""
-    return f"{with_unit(f'{abs(bias):.3g}', unit)} too {'low' if bias < 0 else 'high'}"
-
-
 def wrapped(text: str, first: str, rest: str) -> list[str]:
     """Wrap a text to the terminal's width; `first` and `rest` are the lines' indents."""
     wrapper = TextWrapper(columns(), initial_indent=first, subsequent_indent=rest)

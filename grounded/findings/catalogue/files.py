@@ -296,9 +296,6 @@ START: dict[str, Entry] = {
 
 # a manoeuvre that was drawn
 TARGET: dict[str, Entry] = {
-    "readings": note(
-        "the sensor of {about} reads {bias}, and the target is in its readings; it ends at {end}"
-    ),
     "start": note(
         "[task] start is where {about} rests: {start}",
         "if runs begin elsewhere, change it and draw the target again",

@@ -1,10 +1,7 @@
 """Find when commands change in an uncut log: where its control steps begin, and what came before.
 
 If commands changed in the middle of grid steps, each would be up to half a step early or late, so
-the data start at a change. If they change at any time, as a driver's do, a step has their mean. A
-recording that starts in motion does not contain the commands before it, but a model with a delay
-needs them in the first steps. Such data start where the commands have been constant for a while. A
-robot that stands still until its first command had no command before, or one that keeps it at rest.
+the data start at a change. If they change at any time, as a driver's do, a step has their mean.
 """
 
 from __future__ import annotations
@@ -25,8 +22,6 @@ TOUCH = 0.01  # of a step: tolerance of the phase
 TRIED = 256  # changes whose phases are tried
 MOVED = 0.05  # of a step: a start nearer to a change than this is not moved
 HELD = 0.5  # share of repeated rows above which rows are not written at changes of commands
-STEADY_S, STEADY_STEPS = 0.25, 4  # commands are steady if constant for both times
-LOOK_S, LOOK = 3.0, 0.2  # the steady moment is sought within this time and share of a log
 
 
 def phase_of(
@@ -114,14 +109,13 @@ def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
     return max((held_rows(s.t, s.y) for s in shared), default=0.0)
 
 
-def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) -> tuple[int, bool]:
+def first_step(inputs: Sequence[Samples], start: int, dt: float) -> tuple[int, bool]:
     """Return by how much to move the start of data [ns], and whether commands change in steps.
 
     Args:
         inputs: the commands.
         start: from where every signal is known [ns].
         dt: control step [s].
-        unknown: whether the commands before the start are unknown, see `in_motion`.
     """
     at, late = (
         np.concatenate(x) for x in zip(*(changes_of(s.t, s.y) for s in inputs), strict=True)
@@ -133,8 +127,6 @@ def first_step(inputs: Sequence[Samples], start: int, dt: float, unknown: bool) 
     phase = known and known[0]
     if phase is not None and abs(phase) >= MOVED * dt:
         moved = round((phase if phase > 0 else phase + dt) * 1e9)
-    if unknown:
-        moved = _steady(inputs, found, start, moved, dt)
     return moved, phase is not None or len(later) <= FEW_CHANGES
 
 
@@ -142,19 +134,3 @@ def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:
     """Check whether a table starts with commands that are not those of rest."""
     rows = any(held_rows(s.t, s.y) > 0 for s in inputs)
     return rows and any(s.before(start) != u for s, u in zip(inputs, rest, strict=True))
-
-
-def _steady(inputs: Sequence[Samples], changes: Ints, start: int, moved: int, dt: float) -> int:
-    """Return the shift [ns] to the first step before which no command changed for a while.
-
-    `moved` if there is no such step.
-    """
-    first = max(int(s.t[0]) for s in inputs)
-    length = min(LOOK_S, LOOK * 1e-9 * (max(int(s.t[-1]) for s in inputs) - start))
-    quiet = max(STEADY_S, STEADY_STEPS * dt) * 1e9
-    for k in range(int(length / dt)):
-        at = start + moved + round(k * dt * 1e9)
-        before = changes[changes < at - round(dt * 0.5e9)]
-        if at - max(first, int(before[-1]) if len(before) else first) >= quiet:
-            return at - start
-    return moved

@@ -29,7 +29,16 @@ from grounded_trials.logs.command_steps import (
     in_motion,
     rows_apart,
 )
-from grounded_trials.logs.samples import REGULAR, How, Lead, Samples, at_rest, check_overlap, tidy
+from grounded_trials.logs.samples import (
+    REGULAR,
+    SPARSE,
+    How,
+    Lead,
+    Samples,
+    at_rest,
+    check_overlap,
+    tidy,
+)
 from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
@@ -43,11 +52,6 @@ from grounded_trials.logs.signals import Clock, Series, SignalSpec
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
 ABSOLUTE_S = 1e8  # larger times are stamps, not relative to the beginning of the log
 STEP_LIMIT = 2_000_000
-UNITS_OF_TIME = (1e3, 1e6, 1e9)  # factors if seconds were read as ms, us or ns
-SAMPLES_TO_SAY, STEPS_APART = (
-    10,
-    (0.02, 3.0),
-)  # fewest samples, and plausible intervals in steps, to say so
 
 
 @dataclass(frozen=True)
@@ -239,7 +243,7 @@ class _Commands:
         if rest is None:
             return cls(sent, 0, "hold", False)
         still = at_rest({one.name: one.leading_to(start) for one in tracked}, rates)
-        moved, in_steps = first_step(sent, start, dt, not still and in_motion(sent, start, rest))
+        moved, in_steps = first_step(sent, start, dt)
         return cls(sent, moved, "hold" if in_steps else "mean", still)
 
     def held_before(self, start: int, dt: float, rest: Floats | None) -> tuple[Floats | None, bool]:
@@ -367,11 +371,9 @@ def _crossing(crossing: Crossing, series: Series, which: str, after: int | None)
 
 
 def stamped_otherwise(samples: Iterable[Samples], dt: float) -> float:
-    """Return the interval of samples [s] whose times seem to be in another unit; else 0."""
-    many = [one for one in samples if len(one.t) >= SAMPLES_TO_SAY]
-    every = max((one.interval for one in many), default=0.0)
-    low, high = (apart * dt for apart in STEPS_APART)
-    return every if any(low <= factor * every <= high for factor in UNITS_OF_TIME) else 0.0
+    """Return the longest interval of samples [s] if it is so short that their times seem wrong."""
+    every = max((one.interval for one in samples if len(one.t) > 1), default=0.0)
+    return every if every * SPARSE < dt else 0.0
 
 
 def _steps(start: int, stop: int, dt: float, most: int | None, origin: int, every: float) -> int:

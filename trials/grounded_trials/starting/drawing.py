@@ -33,7 +33,7 @@ from grounded_trials.starting.shapes import (
 )
 from grounded_trials.store.own_files import TRIAL
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.wording import figure, misread
+from grounded_trials.wording import figure
 from grounded_trials.workspace.candidates.at_rest import (
     rest_at_end,
     rest_of_trials,
@@ -103,7 +103,6 @@ def _holds(table: Path, mapping: LogMapping) -> bool:
 
 SECONDS = 5.0  # default duration of a step
 STRAIGHT = 1e3  # times its size: larger turning radii are those of a straight line
-OBEYED = 0.1  # of a sensor's bias: a target that ends there was drawn in readings
 TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 Weights = dict[str, dict[str, float]]  # by kind (state, terminal, input_change) and name
@@ -292,16 +291,6 @@ def _beyond_safety(case: _Case) -> Iterator[Finding]:
             yield found("plan.outside", name, table="safety", weight=Weight.WARN, **facts)
 
 
-def _in_readings(case: _Case) -> Iterator[Finding]:
-    for effect in case.workspace.config.model.effects:
-        family, _, name = str(effect["name"]).partition(":")
-        if family != "sensor_bias" or name not in case.columns:
-            continue
-        b, unit, end = effect["b"], case.units[name], float(case.columns[name][-1])
-        if not math.isclose(end, b, rel_tol=OBEYED):
-            yield found("target.readings", name, bias=misread(b, unit), end=Quantity(end, unit))
-
-
 def _of_log(case: _Case) -> Iterator[Finding]:
     if log := case.workspace.config.seen_in:
         yield found("plan.limits_of_log", log=log)
@@ -318,6 +307,5 @@ TOLD = (
     _in_degrees,
     _of_log,
     _beyond_safety,
-    _in_readings,
     _begins,
 )
