@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,9 +18,6 @@ from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import Noted, candidate_of, noted, sha256
-from grounded_trials.workspace.last_diagnosis import read_diagnosis
-
-Check = tuple[Path, Callable[[], Any]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,46 +43,36 @@ def verify_in(workspace: Folder) -> Verified:
     known = noted(workspace.notes.read(broken))
     broken += known.gone(workspace.store)
     checked = len(workspace.store.list()) + len(workspace.notes.store.list())
-    gone = {Path(one.file).name for one in broken}
-    for path, check in (*_candidates(workspace, known, gone), *_documents(workspace)):
+    there = {path.stem for path in (workspace.folder / "candidates").glob("*.mcap")}
+    stored = {one.id for one in workspace.store.list()} | {Path(one.file).name for one in broken}
+    check: Callable[[Path], Any] = partial(_check_candidate, workspace, known, stored)
+    checks = [(workspace.candidate_path(n), check) for n in sorted(there | set(known.handed))]
+    documents = (workspace.reports / name for name in ("diagnosis.json", "adoptions.json"))
+    checks += [(path, read_document) for path in documents if path.exists()]
+    for path, check in checks:
         checked += 1
         try:
-            check()
+            check(path)
         except GroundedError as error:
             broken.append(Lost(str(path), str(error)))
     return Verified(checked, tuple(broken))
 
 
-def _candidates(workspace: Folder, known: Noted, gone: set[str]) -> Iterator[Check]:
-    """Yield the path of each candidate that exists or existed, with a function that checks it.
+def _check_candidate(workspace: Folder, known: Noted, stored: set[str], path: Path) -> None:
+    """Check the file of a candidate that exists or existed.
 
     Args:
         workspace: the workspace.
         known: its notes.
-        gone: trials that are reported as missing already.
+        stored: trials that are there, or reported as missing already.
+        path: where the file is or was.
     """
-    stored = {one.id for one in workspace.store.list()} | gone
-
-    def check(path: Path) -> None:
-        handed = known.handed.get(path.stem, set())
-        carried = (one.ran in handed for one in workspace.read(strict=False).trials)
-        if not path.exists() and any(carried):  # a trial contains the file
-            return
-        data = read_file(path, FILE_LIMIT, follow=False)
-        lost = sorted({*candidate_of(data, path.stem)[0].seen} - stored)
-        if lost:
-            raise refused("file.changed", path, what="gone", lost=tuple(lost))
-        if handed and sha256(data) not in handed:
-            raise refused("file.changed", path, what="candidate")
-
-    there = {path.stem for path in (workspace.folder / "candidates").glob("*.mcap")}
-    for path in map(workspace.candidate_path, sorted(there | set(known.handed))):
-        yield path, partial(check, path)
-
-
-def _documents(workspace: Folder) -> Iterator[Check]:
-    """Yield the path of each document in reports/, with a function that checks it."""
-    if (path := workspace.reports / "diagnosis.json").exists():
-        yield path, lambda: read_diagnosis(workspace.reports)
-    if (kept := workspace.reports / "adoptions.json").exists():
-        yield kept, partial(read_document, kept)
+    handed = known.handed.get(path.stem, set())
+    carried = (one.ran in handed for one in workspace.whole_trials())
+    if not path.exists() and any(carried):  # a trial contains the file
+        return
+    data = read_file(path, FILE_LIMIT, follow=False)
+    if lost := sorted({*candidate_of(data, path.stem)[0].seen} - stored):
+        raise refused("file.changed", path, what="gone", lost=tuple(lost))
+    if handed and sha256(data) not in handed:
+        raise refused("file.changed", path, what="candidate")
