@@ -92,10 +92,10 @@ def replace_target(
             has other errors; or if a file can't be written.
     """
     columns = checked(columns, model)
-    check_tables(config, model, len(next(iter(columns.values()))))
+    rows = len(next(iter(columns.values())))
+    check_tables(config, model, rows)
     each = usual_weights(model, columns)  # of ranges such as 1800 mm
     weights = {name: float(f"{w:.6g}") for name, w in each.items() if name not in only_at_end}
-    rows = len(next(iter(columns.values())))
     name = config.task.target or "target.csv"
     path = config.file.parent / name
     usual, given = dict[str, float](), dict[str, Array]()
@@ -138,23 +138,17 @@ def checked(columns: Any, model: Model) -> dict[str, Array]:
     for name, given in columns.items():
         if name not in model.states:
             raise unknown("state", name, model.state_names, "the model, for the target,")
-        values = numbers(given, f"target: column '{name}'")
+        what = f"target: column '{name}'"
+        values = numbers(given, what)
         if values.ndim != 1:
-            raise wrong(f"target: column '{name}'", values.shape, shape="(H + 1,)", do="rows")
-        if not np.isfinite(values).all():
-            row = int(np.argmin(np.isfinite(values)))
-            raise wrong(
-                f"target: column '{name}'",
-                got=f"{values[row]:g} in row {row}",
-                must="finite",
-                do="omit",
-            )
+            raise wrong(what, values.shape, shape="(H + 1,)", do="rows")
+        for row in np.flatnonzero(~np.isfinite(values)):
+            raise wrong(what, got=f"{values[row]:g} in row {row}", must="finite", do="omit")
         found[str(name)] = values
     rows = {name: len(values) for name, values in found.items()}
     if len({*rows.values()}) > 1:
         raise wrong("the columns of a target", rows, must="even")
     count = next(iter(rows.values()))
     if not 2 <= count <= MAX_HORIZON + 1:
-        rows_at_most = MAX_HORIZON + 1
-        raise wrong("the rows of a target", count, low=2, high=rows_at_most, do="rows")
+        raise wrong("the rows of a target", count, low=2, high=MAX_HORIZON + 1, do="rows")
     return found
