@@ -40,11 +40,6 @@ def times(**by: float):
     return lambda x: x * [by.get(name, 1.0) for name in NAMES]
 
 
-def swapped(i: int, j: int):
-    order = {i: j, j: i}
-    return lambda x: x[:, [order.get(k, k) for k in range(6)]]
-
-
 def refused(trials):
     with pytest.raises(UnusableTrials) as error:
         preflight(MODEL, trials)
@@ -94,25 +89,6 @@ def test_degrees_and_signs_are_put_right_in_the_one_signal_that_has_them(
         np.testing.assert_allclose(trial.states, other.states, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("fault", "about", "by", "unit"),
-    [
-        (times(x=1e3, y=1e3), ("x", "y"), 1e3, "mm"),
-        (times(u=1e3), ("u",), 1e3, "mm/s"),
-        (swapped(X, Y), ("x", "y"), None, ""),
-        (swapped(U, V), ("u", "v"), None, ""),
-    ],
-)
-def test_another_unit_or_an_exchange_stops_and_says_what_mends_it(sound, fault, about, by, unit):
-    error = refused(changed(sound, fault))
-    first = error.finding
-    assert (first.code, first.about) == ("log.unit" if by else "log.exchange", about)
-    if by:
-        assert (first.facts["by"], first.facts["unit"]) == (pytest.approx(1 / by, rel=1e-5), unit)
-        assert first.facts["tables"] == tuple(f"[log.state.{name}]" for name in about)
-    assert error.then is not None and error.then.arguments == ("t0000", "t0001", "t0002")
-
-
 def test_a_contradiction_of_another_kind_is_told_with_its_rate(sound):
     def other(x: Array) -> Array:
         way = 3 * np.cumsum(np.random.default_rng(3).normal(size=(len(x) // 20 + 2, 2)), axis=0)
@@ -125,13 +101,6 @@ def test_a_contradiction_of_another_kind_is_told_with_its_rate(sound):
     assert odd == {("x", "mismatch"), ("y", "mismatch")}
     assert not any(one.corrected for one in found)
     assert all("psi, u and v" in one.finding for one in found if one.kind == "mismatch")
-
-
-@pytest.mark.parametrize("angle", [np.pi / 2, np.pi])
-def test_a_heading_off_by_a_constant_is_no_exchange_and_no_sign(sound, angle):
-    found = preflight(MODEL, changed(sound, lambda x: x + angle * np.eye(6)[PSI])).findings
-    assert ("psi", "offset", False) in {(one.signal, one.kind, one.corrected) for one in found}
-    assert not {one.kind for one in found} & {"sign", "degrees", "mismatch"}
 
 
 def test_positions_that_are_late_are_told_by_velocities_and_heading(sound, by=0.15):

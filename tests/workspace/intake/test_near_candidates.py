@@ -1,7 +1,4 @@
-"""Runs of nearly equal candidates: an honest noisy run is never refused as another's.
-
-0.1 compared nothing; a ratio of the errors, which came first, refused 10 to 20 % of such runs.
-"""
+"""Runs of nearly equal candidates: an honest noisy run is never refused as another's."""
 
 from dataclasses import replace
 

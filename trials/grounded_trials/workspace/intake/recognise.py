@@ -419,17 +419,10 @@ def _lasting_s(log: Recording) -> float:
 def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
     """Return the candidates that may still be on the robot: of the task, and of earlier ones.
 
-    They are the latest ones. Those of the task are preceded by the best; those of earlier tasks
-    have as many steps as a run of this one.
+    They are the latest ones; those of earlier tasks have as many steps as a run of this one.
     """
-    task, (latest, earlier) = workspace.task, latest_candidates(workspace, OTHERS)
-    earlier = [one for one in earlier if _like_task(one.policy, task)]
-    if len(workspace.candidate_ids()) <= OTHERS:
-        return latest, earlier
-    best = standing_in(workspace).incumbent
-    if best is not None and best.candidate.id not in [one.id for one in latest]:
-        latest = [best.candidate, *latest]
-    return latest, earlier
+    latest, earlier = latest_candidates(workspace, OTHERS)
+    return latest, [one for one in earlier if _like_task(one.policy, workspace.task)]
 
 
 def _like_task(policy: Policy, task: Task) -> bool:
