@@ -254,7 +254,7 @@ def process_noise(
     if max(record.steps for record in records) < 2:
         raise refused("given.short", what="noise", needs=2)
     batch = batch_of(_enough(records), latency)
-    visible = first_noise(batch, sizes).process
+    visible = first_process(batch, sizes)
     noise = NoiseStd(visible, measurement, batch.dt)
     best, part = filtered(model, batch, noise), 1.0
     for _ in range(ROUNDS):
@@ -356,24 +356,18 @@ def _likelihood(g: Gains, eps: Array, batch: RecordBatch) -> float:
     return -0.5 * total if np.isfinite(total) else -np.inf
 
 
-def first_noise(batch: RecordBatch, sizes: Array | float = 1.0) -> NoiseStd:
-    """Return a rough estimate of the noise from the smoothness of the measurements, as a start.
+def first_process(batch: RecordBatch, sizes: Array | float = 1.0) -> Array:
+    """Return a rough process noise, (n,), a tenth of the first differences, as a start.
 
-    The second differences of a smooth signal are measurement noise (times sqrt 6); the fourth
-    (times sqrt 70) also those of a signal that curves. Process noise is taken as a tenth of the
-    first differences. `sizes` (n,) are the typical magnitudes of states that nothing measures.
+    `sizes` (n,) are the typical magnitudes of states that nothing measures.
     """
     n = batch.start.shape[1]
     y = np.where(batch.seen, batch.y, np.nan)
-    r, q = np.ones(n), 0.05 * np.sqrt(batch.dt) * np.broadcast_to(sizes, n)
-    for i in np.flatnonzero(np.isfinite(y).any(axis=(0, 1))):
-        one = y[..., i]
-        least = max(1e-4 * float(np.nanstd(one)), 1e-9)
-        orders = ((2, 6), (4, 70))  # of the difference, and its variance for white noise
-        r[i] = max(min(_spread(np.diff(one, n=k, axis=0)) / v**0.5 for k, v in orders), least)
-        if np.isfinite(np.diff(one, axis=0)).any():
-            q[i] = max(0.1 * _spread(np.diff(one, axis=0)), least)
-    return NoiseStd(q, r, batch.dt)
+    q = 0.05 * np.sqrt(batch.dt) * np.broadcast_to(sizes, n)
+    for i in np.flatnonzero(np.isfinite(np.diff(y, axis=0)).any(axis=(0, 1))):
+        least = max(1e-4 * float(np.nanstd(y[..., i])), 1e-9)
+        q[i] = max(0.1 * _spread(np.diff(y[..., i], axis=0)), least)
+    return np.asarray(q)
 
 
 def _enough(records: Sequence[Record]) -> list[Record]:

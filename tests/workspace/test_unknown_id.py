@@ -66,6 +66,11 @@ def test_discard_and_restore_report_what_they_did_not_change(ran):
     with pytest.raises(GroundedError, match="t0001") as refused:
         ran.export("t0001")
     assert refused.value.then.arguments == ("t0001",) and refused.value.then.verb == "restore"
+    ran.discard("t0002")
+    with pytest.raises(GroundedError) as refused:  # nothing is left to fit
+        ran.fit()
+    assert refused.value.then.arguments == ("t0002",) and refused.value.then.verb == "restore"
+    ran.restore("t0002")
     done = ran.restore("t0001")
     assert done.to_json() == {
         **{"trials": ["t0001"], "unchanged": []},

@@ -24,7 +24,6 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.hypotheses.variations import (
     HOPEFUL,
     TUNED,
-    reordered,
     swapped,
     sweep,
     tune,
@@ -203,7 +202,6 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         firsts = [max(fits, key=search.score) for fits in added if fits]  # noise differs between
         search.refined(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
         search.again(search.of_size(size + 1)[:2])
-        reordered(search, search.of_size(size + 1)[:HOPEFUL])
         search.refined(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
         for fit in search.of_size(size + 1)[:TUNED]:

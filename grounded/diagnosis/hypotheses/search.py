@@ -368,55 +368,15 @@ def undefined(predictor: Predictor) -> GroundedError:
 MATTERS = 1e-3  # rms change of an input, relative to its spread, from which the order matters
 
 
-def orders(predictor: Predictor, h: Hypothesis) -> list[Hypothesis]:
-    """Return a hypothesis with one of its effects on inputs moved to another place in their order.
-
-    Orders in which all inputs arrive nearly as in another one are left out: effects on different
-    inputs, or ones that commute.
-    """
-    acting = acting_order([effect.family for effect in h.effects])
-    places = [(i, at) for i in acting for at in range(len(acting))]
-    return _different(predictor, h, acting, places)
-
-
 def first(predictor: Predictor, h: Hypothesis) -> list[Hypothesis]:
-    """Return a hypothesis with its latest effect acting first, if that changes an input."""
-    latest = len(h.effects) - 1
-    acting = acting_order([effect.family for effect in h.effects])
-    places = [(latest, 0)] if latest in acting and latest else []
-    return _different(predictor, h, acting, places)
-
-
-def _different(
-    predictor: Predictor,
-    h: Hypothesis,
-    acting: Sequence[int],
-    places: Sequence[tuple[int, int]],
-) -> list[Hypothesis]:
-    """Return the hypotheses in which effect i acts at another place, if inputs then differ.
-
-    acting: the effects on inputs, in the order in which they act.
-    """
-    if len(acting) < 2 or not places:
+    """Return a hypothesis with its latest effect acting first, if inputs then arrive otherwise."""
+    latest, acting = len(h.effects) - 1, acting_order([effect.family for effect in h.effects])
+    if latest not in acting or len(acting) < 2:
         return []
-    u = predictor.inputs(h)
-    known, least = [u], MATTERS * np.maximum(u.std(axis=(0, 1)), 1e-12)
-    found = []
-    for i, at in places:
-        rest = [j for j in acting if j != i]
-        other = _in_order(h, [*rest[:at], i, *rest[at:]])
-        u = predictor.inputs(other)
-        apart = [np.sqrt(((u - v) ** 2).mean(axis=(0, 1))) for v in known]
-        if all((a > least).any() for a in apart):
-            known.append(u)
-            found.append(other)
-    return found
-
-
-def _in_order(h: Hypothesis, acting: Sequence[int]) -> Hypothesis:
-    """Return a hypothesis with its effects on inputs in another order, the others in place."""
-    places = iter(acting)
+    places = iter([latest, *(i for i in acting if i != latest)])  # the others stay where they are
     order = [next(places) if i in acting else i for i in range(len(h.effects))]
-    return replace(
-        h, effects=tuple(h.effects[i] for i in order), values=tuple(h.values[i] for i in order)
-    )
+    effects, values = tuple(h.effects[i] for i in order), tuple(h.values[i] for i in order)
+    other = replace(h, effects=effects, values=values)
+    u, v = predictor.inputs(h), predictor.inputs(other)
+    apart, spread = np.sqrt(((u - v) ** 2).mean(axis=(0, 1))), u.std(axis=(0, 1))
+    return [other] * bool((apart > MATTERS * np.maximum(spread, 1e-12)).any())

@@ -8,17 +8,16 @@ converges, with constants of its own:
     one for several effects of single inputs become one of several inputs (`delay:a+b`)
     fewer inputs    an effect of several inputs becomes one of some of them, or one of each
     plain friction  a richer friction of a joint becomes its plain dry friction
-    another order   effects act on a command in another order: a gain before or after a rate limit
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch, orders
+from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -52,7 +51,6 @@ def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
         varied(search, best)
         new = [f for f in search.of_size(size)[:HOPEFUL] if f.hypothesis.names not in known]
         search.refined(new, TO_THE_TOP)
-        reordered(search, new)
         tune(search, [search.latest(fit) for fit in new])
         before, best = best, search.of_size(size)[0]
         if set(best.hypothesis.names) == set(before.hypothesis.names):
@@ -174,23 +172,6 @@ def in_place(h: Hypothesis, change: Change) -> Hypothesis:
         for other, own in change.get(effect.name, ((effect, values),)):
             found = found.plus(other, own)
     return found
-
-
-def reordered(search: HypothesisSearch, fits: Sequence[Fitted]) -> None:
-    """Fit the sets of these fits with their effects on inputs in other orders, while they gain.
-
-    Another order has to be clearly likelier. A dead zone before a gain, for example, is the same as
-    another one after it.
-    """
-    for fit in fits:
-        for _ in range(ROUNDS):
-            starts = [(h, fit.noise, fit.track) for h in orders(search.predictor, fit.hypothesis)]
-            found = refine(search.predictor, starts, iterations=TO_THE_TOP, worth=search.score)
-            best = max(found, key=search.score, default=fit)
-            if search.score(best) < search.score(search.latest(fit)) + NATS:
-                break
-            search.keep([best])
-            fit = best
 
 
 FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is changed

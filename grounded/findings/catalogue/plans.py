@@ -250,7 +250,8 @@ SEARCH: dict[str, Entry] = {
         "dt]][[!unusable? workspace]][[; did you mean '{meant}'?]][[; there are: {known}]]",
     ),
     "no_trial": refuse(
-        "there is no trial to learn from", "ingest runs of candidates, or other logs with --data"
+        "there is no trial to learn from[[: {about} {about:is/are} set aside]]",
+        "ingest runs of candidates, or other logs with --data",
     ),
     "none_waits": refuse(
         "[[{log} does not say which candidate it ran, and ]]no candidate is waiting for a trial",

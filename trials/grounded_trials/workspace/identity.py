@@ -309,9 +309,11 @@ def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str])
     if isinstance(names, str):
         raise wrong("trials", names, must="names", like=f"['{names}']")
     given = list_of(names, str, "trials")
+    aside = [*workspace.discarded()]
     if not usable:
-        raise refused("search.no_trial")
-    stored = {one.id for one in workspace.store.list()} - {*workspace.discarded()}
+        then = NextCommand("restore", (aside[-1],)) if aside else None
+        raise refused("search.no_trial", *aside, then=then)
+    stored = {one.id for one in workspace.store.list()} - {*aside}
     for name in given:
         if name.lower() in stored.difference(usable):
             raise refused(
