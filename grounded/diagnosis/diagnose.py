@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import partial
 
 import numpy as np
 
@@ -121,7 +121,9 @@ def diagnose(
             search for one more effect ends, and what was found before it is returned.
         GroundedError: if the trials don't fit the model, or hold no data.
     """
-    options = _checked(subject, trials, options)
+    of_type("model", subject, Task, Model)
+    list_of(trials, Trial, "trials")
+    options = of_type("options", options or DiagnosisOptions(), DiagnosisOptions)
     tick = Stages(progress)
     tick("instruments")
     sound = sound_data(
@@ -192,15 +194,6 @@ def diagnose(
     return result
 
 
-def _checked(subject: Any, trials: Any, options: Any) -> DiagnosisOptions:
-    """Return the options; raise GroundedError for arguments of another type."""
-    of_type("model", subject, Task, Model)
-    list_of(trials, Trial, "trials")
-    if options is not None:
-        of_type("options", options, DiagnosisOptions)
-    return options or DiagnosisOptions()
-
-
 def _offered(
     data: Data, looked: Preflight, options: DiagnosisOptions
 ) -> tuple[tuple[Effect, ...], tuple[Effect, ...]]:
@@ -237,6 +230,7 @@ class Loop:
         self.search, self.ruler, self.tick = search, ruler, tick
         self.limit, self.whole = max_effects or MOST_EFFECTS, max_effects is not None
         self.most = min(self.limit, many + 1 if many > USUAL_EFFECTS else USUAL_EFFECTS)
+        self.restarts = len(search.candidates) > PAIR  # may yet start without its leader
         self.decision: Decision | None = None
         self.cut_short = False
 
@@ -250,16 +244,14 @@ class Loop:
         try:
             self.tick("predict")
             self.decision = decide(self.search, self.ruler)
-            restarts = len(self.search.candidates) > PAIR
-            while grow := self._next(restarts):
+            could = self.restarts
+            while grow := self._next(before := self.decision):
                 self.tick.beside = "one more effect; Ctrl-C keeps what was found"
                 self.tick("more effects")
-                before = self.decision
-                grow(before)
+                grow()
                 self.decision = decide(self.search, self.ruler)
-                if grow == self._restarted:
-                    restarts = False
-                elif not self.ruler.gain(before.fit, self.decision.fit).clear:
+                restarted, could = could and not self.restarts, self.restarts
+                if not (restarted or self.ruler.gain(before.fit, self.decision.fit).clear):
                     break
         except KeyboardInterrupt:
             if self.decision is None:
@@ -269,30 +261,18 @@ class Loop:
             self.tick("leftover")
         return self.decision
 
-    def _next(self, restarts: bool) -> Callable[[Decision], None] | None:
+    def _next(self, decision: Decision) -> Callable[[], object] | None:
         """Return how the search goes on, None if it is over."""
-        decision = self.decision
-        assert decision is not None
-        fit, size = decision.fit, len(decision.fit.hypothesis.names)
-        if not (decision.gap or self.whole):
-            return None
-        if restarts and decision.gap and decision.leader:
-            return self._restarted
-        if decision.gap and 0 < size < self.most and fit is not self.search.of_size(size)[0]:
-            return self._extended
-        more = self.most < self.limit and (self.whole or size >= self.most)
-        return self._enlarged if more else None
-
-    def _restarted(self, decision: Decision) -> None:
-        size = len(decision.fit.hypothesis.names)
-        regrown(self.search, decision.leader, max(size, PAIR))
-
-    def _extended(self, decision: Decision) -> None:
-        grown(self.search, decision.fit, len(decision.fit.hypothesis.names) + 1)
-
-    def _enlarged(self, decision: Decision) -> None:
-        self.most += 1
-        grown(self.search, self.search.chosen(self.most), self.most)
+        search, fit, size = self.search, decision.fit, len(decision.fit.hypothesis.names)
+        if decision.gap and self.restarts and decision.leader:
+            self.restarts = False
+            return partial(regrown, search, decision.leader, max(size, PAIR))
+        if decision.gap and 0 < size < self.most and fit is not search.of_size(size)[0]:
+            return partial(grown, search, fit, size + 1)
+        if self.most < self.limit and (self.whole or (decision.gap and size >= self.most)):
+            self.most += 1
+            return partial(grown, search, search.chosen(self.most), self.most)
+        return None
 
 
 def _sensor_delays(result: Diagnosis, model: Model, adopted: Collection[str]) -> dict[str, float]:

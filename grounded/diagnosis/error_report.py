@@ -90,11 +90,6 @@ class Gap(Document):
     floor: float = math.nan
     held_out: bool = False
 
-    @property
-    def measured(self) -> bool:
-        """Whether the document contains a gap."""
-        return self != Gap()
-
 
 @dataclass(frozen=True, eq=False)
 class RulerRow(Document):
@@ -359,11 +354,6 @@ def open_noise(rows: Sequence[RulerRow]) -> str:
     """Return the state whose error may be noise, for lack of repeats; "" if that is known."""
     row = furthest([row for row in rows if row.floor_at_most])
     return "" if row is None or excess(rows) else row.most_off
-
-
-def noise_unknown(row: RulerRow, names: Sequence[str]) -> bool:
-    """Check whether only an upper bound of the noise is known, and errors may be within it."""
-    return row.floor_at_most and any(row.above.get(name, 0.0) <= ABOVE for name in names)
 
 
 def errors(row: RulerRow, name: str, **columns: str) -> dict[str, Any]:

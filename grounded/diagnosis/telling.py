@@ -20,11 +20,10 @@ from grounded.diagnosis.error_report import (
     errors,
     excess,
     furthest,
-    noise_unknown,
     states_told,
     telling,
 )
-from grounded.diagnosis.levels import SHOWS
+from grounded.diagnosis.levels import ABOVE, SHOWS
 from grounded.figures.figure import Figure, Panel, bars, curve, legend, panel
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
@@ -131,7 +130,8 @@ def errors_line(d: Diagnosis) -> Iterator[Finding]:
             facts.pop(f"before{end}", None)
     if "now" not in facts:
         return
-    if not noise_unknown(row, names):  # beside a bound the error would look like noise
+    # beside an upper bound of the noise, an error within it would look like noise
+    if not (row.floor_at_most and any(row.above.get(name, 0.0) <= ABOVE for name in names)):
         facts |= errors(row, names[0], noise="noise_floor")
     yield found(
         "gap.errors",
@@ -246,7 +246,8 @@ def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
     Evidence is what is lost without an effect that is claimed or tied; `alone` is what another one
     gains in place of all claimed ones.
     """
-    beside = weighed_beside(diagnosis)
+    beside = {name for group in diagnosis.indistinguishable for name in group}
+    beside |= {row.effect for row in diagnosis.ranking if row.claimed}
     rows: list[Cells] = [
         (
             ("* " if r.claimed else "  ") + r.effect,
@@ -256,15 +257,6 @@ def effect_table(diagnosis: Diagnosis) -> tuple[list[Cells], Cells]:
         for r in diagnosis.ranking
     ]
     return rows, ("effect (*: claimed)", "evidence [nats]", "alone [nats]", "value")
-
-
-def weighed_beside(diagnosis: Diagnosis) -> set[str]:
-    """Return the effects whose evidence is what is lost without them: claimed or tied with these.
-
-    That of the other ranked effects is what they gain alone.
-    """
-    tied = {name for group in diagnosis.indistinguishable for name in group}
-    return tied | {row.effect for row in diagnosis.ranking if row.claimed}
 
 
 def _evidence(row: Ranked) -> str:

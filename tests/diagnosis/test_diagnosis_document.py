@@ -44,7 +44,7 @@ def test_an_older_document_is_read_with_what_it_has():
     assert found.values("viscous_friction:v") == {"k": 0.3}
     assert again(found) == found
     oldest = Diagnosis.from_json({"verdict": {"kind": "none"}})
-    assert not oldest.gap.measured and math.isnan(oldest.gap.before) and oldest.ranking == ()
+    assert math.isnan(oldest.gap.before) and oldest.ranking == ()
     assert again(oldest) == oldest
     unknown = {"code": "gap.of_old", "weight": "note", "about": [], "facts": {}, "nats": None}
     other = unknown | {"code": "gap.tie"}  # whose facts had other names

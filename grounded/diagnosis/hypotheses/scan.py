@@ -133,7 +133,6 @@ class _Context(Shared):
         self.delays = delays_of(h, data)
         self.white = fit.white
         self.together = max(8, min(BLOCK, int(MOST_NUMBERS / fit.white.size)))
-        self._zeros: dict[tuple[int, int], Array] = {}
         self.base = fit.covariance if fit.gram.shape[-1] else np.zeros((0, 0))
 
     def columns(self, i: int, effect: Effect, points: _Points) -> list[_Column]:
@@ -269,7 +268,7 @@ class _Context(Shared):
         for runs, gains, beside in self._parts:
             count = len(range(B)[runs])
             d = _side_by_side([c.d[:, runs] for c in block], (L, count, n, wide))
-            r = self._still(count, wide)
+            r = np.zeros((L + 1, count, n, wide))
             if delays:
                 r = _side_by_side([c.r[:, runs] for c in block], (L + 1, count, n, wide))
             flat = kalman.innovations(gains, d, r)[0].reshape(-1, wide)
@@ -293,13 +292,6 @@ class _Context(Shared):
             (cut, self.gains.of_runs(cut), columns[:, cut].reshape(-1, columns.shape[-1]))
             for cut in (slice(at, at + some) for at in range(0, B, some))
         ]
-
-    def _still(self, count: int, wide: int) -> Array:
-        """Return zeros (L + 1, count, n, wide), which nobody writes to."""
-        L, _, n = self.white.shape
-        if (count, wide) not in self._zeros:
-            self._zeros[count, wide] = np.zeros((L + 1, count, n, wide))
-        return self._zeros[count, wide]
 
     @cached_property
     def base_white(self) -> Array:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.finding import Finding as Fault
 from grounded.accounts.finding import Preflight
 from grounded.accounts.lag import whole_steps
 from grounded.accounts.sound_trials import sound_trials
@@ -106,8 +105,10 @@ def sound_data(
     first = len(trials) if compare else None
     looked = sound_trials(subject, [*trials, *compare], hidden, first, one_message)
 
-    # late logs of whole steps are shifted, filters are undone in the likelihood
-    model = with_measured_filters(model, looked.findings)
+    # late logs of whole steps are shifted, filters are undone in the likelihood; those of adopted
+    # filters that sensors show alone are held, as the physics would fit what it lacks with them
+    seen = {f"sensor_lag_{one.signal}_tau" for one in looked.findings if one.kind == "lag"}
+    model = model.holding(seen & {*model.params})
     data = prepare(model, looked.trials, latency, past, hidden)
     filters = {model.state_names.index(name): tau for name, tau in looked.filters.items()}
     moved = [f for f in looked.findings if f.corrected and f.kind == "delay"]
@@ -118,16 +119,6 @@ def sound_data(
     known = replace(known, findings=(*known.findings, *copies, *more, *told))
     exact = bool(copies or more) and not (scattered(trials) or scattered(compare))
     return Sound(data, looked, known, sum(trial.known_steps >= 2 for trial in trials), exact, told)
-
-
-def with_measured_filters(model: Model, findings: Sequence[Fault]) -> Model:
-    """Return the model with the constants of adopted sensor filters held that sensors show alone.
-
-    The physics would shift them to fit what it lacks: 0.050 s, seen in the speed beside its
-    position, became 0.035 s.
-    """
-    seen = {f"sensor_lag_{one.signal}_tau" for one in findings if one.kind == "lag"}
-    return model.holding(seen & {*model.params})
 
 
 def limits(data: Data, left_out: Collection[str] = ()) -> Limits:
