@@ -213,22 +213,11 @@ def whiteness(fit: Fitted, seen: Array) -> Array:
 MOST_VARIABLES = 2  # most variables
 
 
-@dataclass(frozen=True)
-class _Curve:
-    """A variable, the ends of its range, and the basis functions over it (L, B, KNOTS)."""
-
-    over: str
-    lo: float
-    hi: float
-    columns: Array
-
-    def values(self, weights: Array) -> dict[str, float]:
-        """Return the quantities of the effect."""
-        return {"lo": self.lo, "hi": self.hi} | {f"w{k}": float(w) for k, w in enumerate(weights)}
-
-
 def correction(ruler: Ruler, fit: Fitted, left: Sequence[Leftover]) -> Correction | None:
     """Fit and test a correction of the channel with the largest leftover.
+
+    It is tested as a leftover is: on predictions of each fold, its weights from the others. Its
+    gain is the share of the channel's squared error that is gone, a mean over horizons.
 
     Args:
         ruler: tests it on predictions.
@@ -238,76 +227,61 @@ def correction(ruler: Ruler, fit: Fitted, left: Sequence[Leftover]) -> Correctio
     Returns:
         The correction; None without a leftover, with a single trial, or if no curve gains enough.
     """
-    predictor = ruler.predictor
-    if not left or predictor.data.count < 2:
+    predictor, data = ruler.predictor, ruler.data
+    if not left or data.count < 2:
         return None
-    i = predictor.data.model.state_names.index(left[0].channel)
-    chosen, gains = list[_Curve](), filter_of(predictor, fit)
+    channel, basis, gains = left[0].channel, _bases(predictor, fit), filter_of(predictor, fit)
+
+    def features(names: Sequence[str]) -> Array:
+        return np.concatenate([basis[name][2] for name in names], axis=-1)
+
+    # variables, one after the other, while held-out trials gain
+    i, chosen = data.model.state_names.index(channel), list[str]()
     best, weights = PICKED, np.zeros((0, 0))
-    while len(chosen) < MOST_VARIABLES:
-        rivals = [c for c in _curves(predictor, fit) if c.over not in [o.over for o in chosen]]
-        tried = [
-            (held_out_columns(predictor, fit, gains, _joined([*chosen, c]), i), c) for c in rivals
-        ]
-        if not tried:
-            break
-        (gain, _, each), curve = max(tried, key=lambda pair: pair[0][0])
+    while len(chosen) < MOST_VARIABLES and (rivals := [n for n in basis if n not in chosen]):
+        tried = {
+            n: held_out_columns(predictor, fit, gains, features([*chosen, n]), i) for n in rivals
+        }
+        name = max(tried, key=lambda n: tried[n][0])
+        gain, _, each = tried[name]
         if gain < best + PICKED * bool(chosen):
             break
-        best, weights, chosen = gain, each, [*chosen, curve]
-    return _judged(ruler, fit, left[0].channel, chosen, weights) if chosen else None
+        best, weights, chosen = gain, each, [*chosen, name]
+    if not chosen:
+        return None
+
+    # what predictions gain, and the shape of each curve
+    found = ruler.corrected(fit, channel, held_out_rate(data, features(chosen), weights))[0]
+    gain = 1 - float(np.exp(-2 * found.channels[ruler.names.index(channel)]))
+    curves = []
+    for name, own in zip(chosen, np.split(weights, len(chosen), axis=1), strict=True):
+        lo, hi, _ = basis[name]
+        shape = np.linspace(lo, hi, KNOTS), own[-1], jackknife(own[:-1])
+        at, value, std = (tuple(row.tolist()) for row in shape)
+        quantities = {"lo": lo, "hi": hi} | {f"w{k}": w for k, w in enumerate(value)}
+        curves.append(Curve(f"correction:{channel}<-{name}", name, at, value, std, quantities))
+    return Correction(
+        channel=channel,
+        over=tuple(chosen),
+        held_out_gain=gain,
+        adoptable=found.clear and gain > 0,
+        unit=per_second(data.model.states[channel]),
+        curves=tuple(curves),
+    )
 
 
-def _joined(curves: Sequence[_Curve]) -> Array:
-    return np.concatenate([one.columns for one in curves], axis=-1)
+def _bases(predictor: Predictor, fit: Fitted) -> dict[str, tuple[float, float, Array]]:
+    """Return basis functions over every measured state and every received input.
 
-
-def _curves(predictor: Predictor, fit: Fitted) -> list[_Curve]:
-    """Return basis functions over every measured state and every received input."""
+    {variable: (ends of its range, and the functions (L, B, KNOTS))}
+    """
     data, model = predictor.data, predictor.data.model
     x, u = fit.track[:-1], predictor.inputs(fit.hypothesis)
     signals = {n: x[..., i] for i, n in enumerate(model.state_names) if i not in data.hidden}
     signals |= {n: u[..., j] for j, n in enumerate(model.input_names)}
-    found = []
+    found = {}
     for name, r in signals.items():
         lo, hi = (float(q) for q in np.quantile(r[data.valid.T > 0], [0.02, 0.98]))
         if hi - lo > 1e-6 * max(abs(lo), abs(hi), 1e-9):
-            found.append(_Curve(name, lo, hi, np.stack(bells(r, lo, hi), axis=-1)))
+            found[name] = lo, hi, np.stack(bells(r, lo, hi), axis=-1)
     return found
-
-
-def _judged(
-    ruler: Ruler, fit: Fitted, channel: str, curves: Sequence[_Curve], weights: Array
-) -> Correction:
-    """Test a correction as a leftover is: by predictions of each fold, its weights from the others.
-
-    Its gain is the share of the channel's squared error that is gone, a mean over horizons.
-    """
-    data = ruler.data
-    rate = held_out_rate(data, _joined(curves), weights)
-    found = ruler.corrected(fit, channel, rate)[0]
-    gain = 1 - float(np.exp(-2 * found.channels[ruler.names.index(channel)]))
-    unit, shapes = per_second(data.model.states[channel]), []
-    for k, one in enumerate(curves):
-        whole = weights[-1][k * KNOTS : (k + 1) * KNOTS]
-        apart = weights[:-1, k * KNOTS : (k + 1) * KNOTS]
-        spread = jackknife(apart)
-        places = np.linspace(one.lo, one.hi, KNOTS)
-        shapes.append(
-            Curve(
-                f"correction:{channel}<-{one.over}",
-                one.over,
-                tuple(float(p) for p in places),
-                tuple(float(w) for w in whole),
-                tuple(float(s) for s in spread),
-                one.values(whole),
-            )
-        )
-    return Correction(
-        channel=channel,
-        over=tuple(one.over for one in curves),
-        held_out_gain=gain,
-        adoptable=found.clear and gain > 0,
-        unit=unit,
-        curves=tuple(shapes),
-    )
