@@ -23,7 +23,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -53,16 +52,7 @@ IDENTICAL = 1e-6  # fraction of a slope's power by which two equivalent effects 
 MOST_LOOKALIKES = 3  # most look-alikes fitted per effect
 
 
-class Likeness(NamedTuple):
-    """A candidate that gains nearly what an effect gains.
-
-    Attributes:
-        effect: the name of the effect.
-        like: that of the candidate.
-    """
-
-    effect: str
-    like: str
+Likeness = tuple[str, str]  # an effect, and a candidate that gains nearly what it gains
 
 
 def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
@@ -90,7 +80,7 @@ def lookalikes(search: HypothesisSearch, best: Fitted) -> tuple[Likeness, ...]:
         for share, look in near:
             if not (share > NEARLY and look.values):
                 continue
-            found.append(Likeness(effect.name, look.effect.name))
+            found.append((effect.name, look.effect.name))
             names = tuple(sorted((*rest.names, look.effect.name)))
             known = search.fits.get((best.noise.structure, h.spread, names))
             alike = any(one_friction(look.effect, other) for other in rest.effects)
@@ -235,7 +225,7 @@ def one_clock(
         side, other = (inputs, states) if effect.family.name == "delay" else (states, inputs)
         if {*effect.site.targets} == {*side} and other:
             like = f"{FAMILIES[effect.family.name]}:{'+'.join(other)}"
-            found.append(Likeness(effect.name, like))
+            found.append((effect.name, like))
     return tuple(found)
 
 

@@ -74,7 +74,7 @@ class Claims:
         self.alike = decision.alike
         late = [e for e, values in best.hypothesis.pairs if values.get("d", 0.0) >= 0]
         clock = one_clock(self.data.model, late, ruler.names, excitation(self.data).still)
-        self.same = [] if known.no_cause else [(one.effect, one.like) for one in clock]
+        self.same = [] if known.no_cause else [*clock]
 
     def _known(self, off: dict[int, float]) -> dict[int, float]:
         """Return the parameters that are off by as much as trials agree on, if one clearly is.
@@ -250,7 +250,7 @@ class Claims:
         if score(best) - score(fit) < NATS:
             return self._as_likely(fit)
         known, other_known = (score(f) - b * f.loglik for f in (best, fit))
-        alike = (name, other) in {(one.effect, one.like) for one in self.alike}
+        alike = (name, other) in self.alike
         return alike and abs(known - other_known) < NATS and self._twins(name, other)
 
     def _as_likely(self, fit: Fitted) -> bool:

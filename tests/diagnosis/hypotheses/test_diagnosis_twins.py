@@ -124,7 +124,7 @@ def test_a_look_alike_is_fitted_in_the_place_of_its_effect(search):
     best = max((f for f in search.fits.values() if f.hypothesis.names == own), key=search.score)
     assert best.hypothesis.spread > 0
     with np.errstate(all="ignore"):
-        found = [one.like for one in lookalikes(search, best)]
+        found = [like for _, like in lookalikes(search, best)]
     assert "input_gain:c" in found and own[0] not in found
     h = best.hypothesis
     other = [f for k, f in search.fits.items() if k[1] > 0 and k[2] == ("input_gain:c",)]

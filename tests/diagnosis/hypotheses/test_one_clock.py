@@ -29,7 +29,7 @@ def found(model, *names, shown=None):
 @pytest.mark.parametrize("model", [pendulum, AXES])
 def test_a_delay_of_every_command_is_one_of_every_sensor(model):
     (one,) = found(model, f"delay:{'+'.join(model.input_names)}")
-    assert one.like == f"sensor_delay:{'+'.join(model.state_names)}"
+    assert one[1] == f"sensor_delay:{'+'.join(model.state_names)}"
 
 
 def late(steps: int, seed: int = 0, count: int = 240) -> Trial:
