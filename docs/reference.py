@@ -82,14 +82,10 @@ def findings() -> str:
         "may change. `grounded explain CODE` prints an entry. Text in brackets appears where its "
         "facts, in `< >`, are known.",
     ]
-    for area in catalogue.AREAS:
-        module = import_module(f"{catalogue.__name__}.{area}")
-        rows = [
-            f"## {area}",
-            f"{inspect.getdoc(module)}",
-            "| code | weight | says | remedy |\n|---|---|---|---|",
-        ]
-        for code, one in catalogue.entries(area).items():
+    for area, entries in catalogue.AREAS.items():
+        rows = [f"## {area}", "| code | weight | says | remedy |\n|---|---|---|---|"]
+        for name, one in entries.items():
+            code = f"{area}.{name}"
             cells = [f"`{code}`", one.weight, bare(one.short), bare(one.remedy)]
             rows[-1] += "\n| " + " | ".join(cell.translate(PLAIN) for cell in cells) + " |"
         parts += rows

@@ -9,7 +9,7 @@ from typing import NamedTuple
 class Entry(NamedTuple):
     """The words of one code.
 
-    Args:
+    Attributes:
         weight: one of `WEIGHTS`, which says what it means.
         short: what was found, a clause without a full stop.
         remedy: what to do about it, "" for nothing.
