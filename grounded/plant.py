@@ -8,8 +8,7 @@ a Trial of MEASURED states and COMMANDED inputs, as a robot does.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -56,6 +55,8 @@ class Plant:
     def run(self, policy: Policy, start: Mapping[str, float], rng: np.random.Generator) -> Trial:
         """Run a policy once; the trial ends early if the run diverges.
 
+        Each substep uses the commands that have arrived by its middle.
+
         Args:
             policy: what to run.
             start: start state by name; zero for states not named.
@@ -70,63 +71,37 @@ class Plant:
         for name in self.latency:
             self._index(name, model.input_names)
         x = np.array([start.get(name, 0.0) for name in model.state_names], dtype=float)
-        start_std, process, error = self.stds
-        x += start_std * rng.standard_normal(model.n)
-        runner = Runner(policy)
+        noise, n = self.noise, model.n
+        start_std, process, error = map(self._stds, (noise.start, noise.process, noise.measurement))
+        x += start_std * rng.standard_normal(n)
+        runner, h = Runner(policy), policy.dt / self.substeps
+        # of each input, by how many control steps what arrives by a substep's middle is old
+        middles = (np.arange(self.substeps) + 0.5) * h
+        late = np.array([self.latency.get(name, 0.0) for name in policy.input_names])
+        ages = np.maximum(np.ceil((late - middles[:, None]) / policy.dt - 1e-9), 0).astype(int)
         commands = np.tile(policy.past, (H, 1))
-        measured = np.full((H + 1, len(columns)), np.nan)
-        measured[0] = (x + error * rng.standard_normal(model.n))[columns]
-        done = H
+        measured = [(x + error * rng.standard_normal(n))[columns]]
         for t in range(H):
             commands[t] = runner.action(t * policy.dt, measured[t])
-            x = self.advance(x[None], commands[None], t, policy, order)[0]
-            x = x + process * rng.standard_normal(model.n)
+            for age in ages:
+                arrived = commands[np.maximum(t - age, 0), np.arange(len(order))]
+                u = np.zeros((1, model.m))
+                u[0, order] = np.where(age > t, policy.past, arrived)
+                with np.errstate(all="ignore"):
+                    x = model.system.step(x[None], u, model.values, h)[0]
+            x = x + process * rng.standard_normal(n)
             if not np.isfinite(x).all() or np.abs(x).max() > 1e9:
-                done = t
                 break
-            measured[t + 1] = (x + error * rng.standard_normal(model.n))[columns]
-        return Trial(
-            states=measured[: done + 1],
-            inputs=commands[:done],
-            dt=policy.dt,
-            state_names=policy.state_names,
-            input_names=policy.input_names,
-            start_inputs=policy.past,
-        )
+            measured.append((x + error * rng.standard_normal(n))[columns])
+        states, names = np.array(measured), (policy.state_names, policy.input_names)
+        inputs = commands[: len(states) - 1]
+        return Trial(states, inputs, policy.dt, *names, start_inputs=policy.past)
 
-    def advance(
-        self, x: Array, commands: Array, t: int, policy: Policy, order: Sequence[int]
-    ) -> Array:
-        """Return the states (N, n) of N runs after control step t.
-
-        Each substep uses the command that has arrived by its middle.
-
-        Args:
-            x: states (N, n) before the step.
-            commands: commands sent so far, (N, H, m), in the policy's order of inputs.
-            t: index of the step.
-            policy: the policy that is run.
-            order: index of each of the policy's inputs among the plant's.
-        """
-        h = policy.dt / self.substeps
-        u, values = np.zeros((len(x), self.model.m)), self.model.values
-        with np.errstate(all="ignore"):
-            for i in range(self.substeps):
-                for j, name in enumerate(policy.input_names):
-                    age = self.latency.get(name, 0.0) - (i + 0.5) * h
-                    row = t - math.ceil(age / policy.dt - 1e-9) if age > 0 else t
-                    u[:, order[j]] = commands[:, row, j] if row >= 0 else policy.past[j]
-                x = self.model.system.step(x, u, values, h)
-        return x
-
-    @property
-    def stds(self) -> Array:
-        """Standard deviations of start, process and measurement, (3, n)."""
-        found, noise = np.zeros((3, self.model.n)), self.noise
-        named = (noise.start, noise.process, noise.measurement)
-        for row, by_name in zip(found, named, strict=True):
-            for name, value in by_name.items():
-                row[self._index(name, self.model.state_names)] = value
+    def _stds(self, by_name: Mapping[str, float]) -> Array:
+        """Return standard deviations by state, (n,)."""
+        names, found = self.model.state_names, np.zeros(self.model.n)
+        for name, value in by_name.items():
+            found[self._index(name, names)] = value
         return found
 
     @staticmethod

@@ -100,7 +100,7 @@ def flight_task(model: Model, started_by: Model | None = None) -> Task:
     )
 
 
-def perturbed(model: Model, rng: np.random.Generator, spread: float = 0.2) -> Model:
-    """Return a model with every parameter times an independent U[1 - spread, 1 + spread]."""
-    factors = rng.uniform(1 - spread, 1 + spread, len(model.values))
+def perturbed(model: Model, rng: np.random.Generator) -> Model:
+    """Return a model with every parameter times an independent U[0.8, 1.2]."""
+    factors = rng.uniform(0.8, 1.2, len(model.values))
     return model.with_values(dict(zip(model.param_names, model.values * factors, strict=True)))
