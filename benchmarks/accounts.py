@@ -356,8 +356,8 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         names = [n for n in model.states if units[n] in wanted]
         return [str(rng.choice(names))] if draw and names else names
 
-    def times(names: Sequence[str], by: float, some: Sequence[Trial] = trials) -> list[Trial]:
-        return _set(some, lambda c: c.update({n: by * c[n] for n in names}))
+    def times(names: Sequence[str], by: float) -> list[Trial]:
+        return _set(trials, lambda c: c.update({n: by * c[n] for n in names}))
 
     def shifted(names: Sequence[str], steps: float) -> list[Trial]:
         def moved(x: Array) -> Array:
@@ -470,30 +470,59 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
 
     yield fault("drop-outs", "dropout", [name], _set(trials, drops))
 
-    # much noise, a robot that stands, and several trials of which one is wrong
+    yield from conditions(robot, trials, rng, angle, rate, length and lengths)
+
+
+def conditions(
+    robot: Robot,
+    trials: Sequence[Trial],
+    rng: np.random.Generator,
+    angle: Sequence[str],
+    rate: Sequence[str],
+    lengths: Sequence[str],
+) -> Iterator[Fault]:
+    """Yield logs with much noise, of a robot that stands, and of six trials of which one is wrong.
+
+    Args:
+        robot: the robot.
+        trials: of it.
+        rng: source of what is drawn.
+        angle: an angle of the model, if it has one.
+        rate: a rate of turn, likewise.
+        lengths: its positions.
+    """
+
+    def times(names: Sequence[str], by: float, some: Sequence[Trial]) -> list[Trial]:
+        return _set(some, lambda c: c.update({n: by * c[n] for n in names}))
+
     def shaken(trial: Trial, size: float) -> Trial:
         noise = size * np.array(robot.noise) * rng.normal(size=trial.states.shape)
         return replace(trial, states=trial.states + noise)
 
     def at_rest(trial: Trial) -> Trial:
-        moves = np.array([unit.endswith("/s") for unit in model.states.values()])
+        moves = np.array([unit.endswith("/s") for unit in robot.model.states.values()])
         still = np.broadcast_to(np.where(moves, 0.0, trial.states[0]), trial.states.shape)
         return shaken(replace(trial, states=still, inputs=0.0 * trial.inputs), 1.0)
 
     noisy, rest = [shaken(one, 5.0) for one in trials], [at_rest(one) for one in trials]
     many = [*trials, *driven(robot, rng, 4)]
-    for name, logs in (("noisy", noisy), ("at rest", rest), ("one at rest", [rest[0], trials[1]])):
+    named = (("noisy", noisy), ("at rest", rest), ("one at rest", [rest[0], trials[1]]))
+    for name, logs in (*named, ("six", many)):
         yield Fault(f"{name}: sound", "none", (), logs)
-        if name != "at rest":
-            yield fault(f"{name}: degrees", "unit", angle, times(angle, DEGREES, logs))
-    yield Fault("six: sound", "none", (), many)
-    yield fault("one of six: degrees", "unit", angle, [*times(angle, DEGREES, many[:1]), *many[1:]])
-    yield fault("six: degrees", "unit", angle, times(angle, DEGREES, many))
-    if rate:
-        yield fault("noisy: rate's sign", "sign", rate, times(rate, -1.0, noisy))
-        yield fault("one of six: sign", "sign", rate, [*times(rate, -1.0, many[:1]), *many[1:]])
-    if length:
-        yield fault("noisy: millimetres", "unit", lengths, times(lengths, 1e3, noisy))
+    first, *others = many
+    for name, kind, names, by, some in (
+        ("noisy: degrees", "unit", angle, DEGREES, noisy),
+        ("one at rest: degrees", "unit", angle, DEGREES, [rest[0], trials[1]]),
+        ("six: degrees", "unit", angle, DEGREES, many),
+        ("one of six: degrees", "unit", angle, DEGREES, [first]),
+        ("noisy: rate's sign", "sign", rate, -1.0, noisy),
+        ("one of six: sign", "sign", rate, -1.0, [first]),
+        ("noisy: millimetres", "unit", lengths, 1e3, noisy),
+    ):
+        rest_of = others if name.startswith("one of six") else []
+        if names:
+            changed = [*times(names, by, some), *rest_of]
+            yield Fault(name, kind, (frozenset(names),), changed)
 
 
 # --- candidates -----------------------------------------------------------------------------------
