@@ -35,3 +35,10 @@ def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path)
     rows[:, 0] += 1.764e12
     np.savetxt(tmp_path / "b.csv", rows, "%.1f", ",", header="time_s,v,force", comments="")
     assert begin(tmp_path / "w", tmp_path / "b.csv", kind="generic", inputs=["force"]).dt < 2
+
+
+def test_a_model_that_no_input_moves_is_fitted_before_it_is_diagnosed(tmp_path):
+    log = table(tmp_path / "b.csv", column="t_ms")
+    begin(tmp_path / "w", log, kind="generic", inputs=["force"])
+    done = grounded("-C", tmp_path / "w", "ingest", "--data", log)
+    assert "fit --apply" in done.out.partition("next: ")[2]

@@ -98,10 +98,12 @@ def changes_every(gaps: Array, rows: float) -> float | None:
     changes, coherence = np.cumsum(gaps), dict[float, float]()
     blocks = np.array_split(changes, max(1, len(changes) // TOGETHER))
     for step in STEPS:
-        if APART * rows < step <= LONGEST:
+        once = np.abs(gaps - step) <= WITHIN * step
+        if APART * rows < step <= LONGEST and once.mean() >= ONCE:
             turns = [abs(np.exp(2j * np.pi * block / step).mean()) for block in blocks]
             coherence[step] = float(np.median(turns))
-    return max((step for step, like in coherence.items() if like >= IN_STEP), default=None)
+    best = max(coherence, key=coherence.__getitem__, default=None)
+    return best if best is not None and coherence[best] >= IN_STEP else None
 
 
 def _commanded(inputs: Sequence[Guess]) -> tuple[Guess, ...]:

@@ -9,6 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.search.standing import LOST, Ending, Phase, Standing
@@ -26,7 +28,7 @@ from grounded_trials.workspace.new_target import PROPOSE, TARGET, to_plan, undra
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
 
-DIAGNOSE = NextCommand("diagnose")
+DIAGNOSE, FIT = NextCommand("diagnose"), NextCommand("fit", ("--apply",))
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 BEFORE_TRIALS = ("adopt", "discard")  # verbs of commands that come before another trial
@@ -141,7 +143,7 @@ NEXT: tuple[Row, ...] = (
         lambda s: (
             not s.diagnosis and s.usable and (not s.now.history or s.now.phase is not Phase.PROPOSE)
         ),
-        lambda s: DIAGNOSE,
+        lambda s: to_learn_from(s.workspace),
     ),
     # newer logs or the search's doubt ask for another diagnosis
     (
@@ -182,6 +184,20 @@ def not_ingested(workspace: Folder) -> str:
     return next((str(path) for path in places if path.exists()), "LOG") if log else ""
 
 
+def to_learn_from(workspace: Folder) -> NextCommand:
+    """Return the command that learns from data: `diagnose`, or first `fit`.
+
+    A model that no input moves, as a generic skeleton, has no cause to find before it is fitted.
+    """
+    model = workspace.base_model
+    u = np.append(np.zeros((1, model.m)), np.eye(model.m), axis=0)
+    x = np.zeros((len(u), model.n))
+    with np.errstate(all="ignore"):
+        after = model.system.step(x, u, model.values, workspace.config.task.dt)
+    fitted = not any(one.uncertain for one in model.params.values()) or (after != after[0]).any()
+    return DIAGNOSE if fitted else FIT
+
+
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:
     """Return the command after ingesting a log: usually `propose`, `diagnose` for data or a probe.
 
@@ -200,7 +216,7 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
             ran = handed and any(one.candidate for one in workspace.task_trials())
             if ran and (now := standing_in(workspace)).phase is Phase.AWAIT:
                 return Situation(workspace, now).run
-        return DIAGNOSE
+        return to_learn_from(workspace)
     here = Situation(workspace, now)
     goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT) and not (now.doubt or here.none_stood)
     return PROPOSE if goes_on else here.then
