@@ -39,6 +39,8 @@ from grounded_trials.formats.path_walk import FIELD_LIMIT, evaluate, number_path
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_records, read_apart
+from grounded_trials.logs.samples import MIXED_S
+from grounded_trials.logs.signal_report import SKEW_S
 
 NAMING = {  # types of messages that name joints, and their field
     "/JointState": "name",
@@ -47,8 +49,6 @@ NAMING = {  # types of messages that name joints, and their field
 NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
 DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
 GAP = 10.0  # intervals; longer gaps are reported
-SIMULATED_S = 1.0  # [s] header stamps further from the log's clock are simulation time
-SKEW_S = 0.1  # larger differences between header stamps and the log's clock are reported
 REPEATS = 0.1  # share of samples like the one before, from which a sensor may come in steps
 STEP = 1 / 3  # of a sensor's step: its standard deviation, a little more than 1 / sqrt(12)
 
@@ -107,7 +107,7 @@ class LogReport:
     @property
     def simulated(self) -> bool:
         """Whether header stamps are on another clock than the log, as in a simulation."""
-        return any(t.skew_s is not None and abs(t.skew_s) > SIMULATED_S for t in self.topics)
+        return any(t.skew_s is not None and abs(t.skew_s) > MIXED_S for t in self.topics)
 
     def topic_of(self, path: str) -> TopicReport | None:
         """Return the topic that a path begins with, None if the log has none."""
