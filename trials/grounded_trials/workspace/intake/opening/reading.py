@@ -48,9 +48,8 @@ class Read:
     signals: tuple[SignalReport, ...] = ()
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
-    before: StoredTrial | None = (
-        None  # the trial that was made from the log before and is set aside
-    )
+    # the trial that was made from the log before and is set aside
+    before: StoredTrial | None = None
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
     last_s: float = math.nan  # when all states of a foreign log were last known [s from the start]
