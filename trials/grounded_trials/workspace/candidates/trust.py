@@ -101,10 +101,6 @@ def so_far(made: Candidate, best: Tried) -> Finding:
     """Return the best one's utility and, if it differs clearly, what the model gives it.
 
     The gain of the candidate is counted from what the model gives the best one.
-
-    Args:
-        made: the candidate.
-        best: the best one so far.
     """
     own = best.candidate.id
     unlike = made.base == own and made.unlike(best.utility)
@@ -148,11 +144,7 @@ def predicted(made: Candidate, cost: float, whole: float) -> Finding:
 def trust(workspace: Folder, made: Candidate, now: Standing, replayed: float) -> Finding:
     """Return how far recent predictions were off, and whether the promised gain exceeds that.
 
-    Args:
-        workspace: the workspace with the model.
-        made: what to run next.
-        now: where the search stands.
-        replayed: cost of the noise that its prediction has, from the log that it replays.
+    `replayed` is the cost of the noise that its prediction has, from the log that it replays.
     """
     ran = [tried for tried in now.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
@@ -181,11 +173,9 @@ def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) 
         "real": last[-1].utility if once else None,
     }
     tried = {one.candidate.id for one in now.history}
-    if best is None or made.id in tried or not math.isfinite(missed[-1]):
-        return found("plan.tested", made.id).also(**facts)
-    gain = made.promised_over(best)
-    if made.way == "gentler gains" or not gain > 0:  # no model swings, so none tells its gain
-        return found("plan.tested", made.id).also(**facts)
-    noise = len(best.trials) == 1 and gain < replayed
-    facts |= {"gain": gain, "less": int(gain < missed[-1]), "noise": int(noise)}
+    asked = made.id not in tried and made.way != "gentler gains"  # no model swings
+    gain = made.promised_over(best) if best is not None and asked else 0.0
+    if gain > 0 and best is not None and math.isfinite(missed[-1]):
+        noise = len(best.trials) == 1 and gain < replayed
+        facts |= {"gain": gain, "less": int(gain < missed[-1]), "noise": int(noise)}
     return found("plan.tested", made.id).also(**facts)
