@@ -44,6 +44,7 @@ class Lag:
         high: upper bound of the scale.
         coherence: share of both signals that agrees, 0 to 1.
         scale_std: standard deviation of the scale.
+        slow: the scale of slow motion, from the widest window with enough samples.
     """
 
     delay: float
@@ -54,6 +55,7 @@ class Lag:
     high: float
     coherence: float
     scale_std: float = np.inf
+    slow: float = np.nan
 
     @property
     def scale(self) -> float:
@@ -61,8 +63,13 @@ class Lag:
         return float(np.sqrt(self.low * self.high))
 
     def off(self, by: float) -> bool:
-        """Check whether the scale is off by more than `by`, within its bounds."""
-        return self.low > 1 + by or self.high < 1 - by
+        """Check whether the scale is off by more than `by`, for slow motion as well.
+
+        With only a few samples per period, averaging over a step reduces a signal: that is not a
+        scale error.
+        """
+        slow = self.slow if np.isfinite(self.slow) else self.scale
+        return min(self.low, slow) > 1 + by or max(self.high, slow) < 1 - by
 
     @property
     def one_size(self) -> bool:
@@ -91,7 +98,8 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
         return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
     best = min((one for _, one in clear), key=lambda lag: lag.std)
     apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
-    return replace(best, std=float(np.hypot(best.std, apart)))
+    told = [one.scale for p, one in clear if p.windows >= BLOCKS // 2]  # few windows scatter a lot
+    return replace(best, std=float(np.hypot(best.std, apart)), slow=told[-1] if told else np.nan)
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,11 @@ class _Pieces:
         total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
         place = np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
         return max(float(np.linalg.norm(np.bincount(group, force))) for group in (total, place))
+
+    @property
+    def windows(self) -> int:
+        """Number of windows that do not overlap."""
+        return sum(len(a) for a in self.a) // (2 * self.half + 3)
 
 
 def _smoothed(pairs: Pairs, h: int, reach: int) -> _Pieces:
