@@ -62,9 +62,11 @@ FILE: dict[str, Entry] = {
         "states]][[add rows, or set [task] horizon = {horizon}]]",
     ),
     "grid": refuse(
-        "{about} has sample {sample} at {at:.4f} s instead of {expected:.4f} s, dt is {dt:.6g} s",
+        "{about} has [[sample {sample} at {at:.4f} s instead of {expected:.4f} s]][[a sample "
+        "every {every:.4g} s]], dt is {dt:.6g} s",
         "[[set [task] dt = {each:.6g}, the time in s from one command to the next, or resample "
-        "the rows]][[robot? samples are missing or late, or in another unit: run it again]]",
+        "the rows]][[robot? samples are missing or late: run it again]][[append each at {unit} "
+        "times its stamp: it is in another unit]]",
     ),
     # files and folders
     "missing": refuse(

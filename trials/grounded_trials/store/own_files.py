@@ -156,6 +156,11 @@ class OwnFile:
         off = np.abs(times - dt * np.arange(len(times))) > 0.5 * dt
         if not off.any():
             return
+        apart = float(np.median(np.diff(times, prepend=times[0] - dt)))
+        for factor in (1e3, 1e-3):
+            if abs(apart / (dt * factor) - 1) < 0.1:
+                facts = {"unit": f"{1 / factor:g}", "every": apart, "dt": dt}
+                raise refused("file.grid", f"{self.name}: {topic}", **facts)
         k = int(np.argmax(off))
         facts = {"sample": str(k), "at": times[k], "expected": k * dt, "dt": dt, "robot": 1}
         raise refused("file.grid", f"{self.name}: {topic}", **facts)
