@@ -6,10 +6,12 @@ import os
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+from grounded.errors import NextCommand
 from grounded.refusals import refused
+from grounded.search.pictures import few
 from grounded_cli.console.options import exits, json_asked
 from grounded_cli.console.terminal import (
     next_line,
@@ -21,8 +23,13 @@ from grounded_cli.console.terminal import (
     sparkline,
     table,
 )
-from grounded_trials.report.report_text import report_text
+from grounded_trials.report.findings import Findings
 from grounded_trials.report.reporting import Report
+from grounded_trials.report.tables import about, counted, error_table, improved
+from grounded_trials.wording import folded, rendered, wrapped
+from grounded_trials.workspace.next_step import DIAGNOSE
+
+ROWS = 15  # candidates in the table; others are counted
 
 
 def report(html: bool, png: bool, rrd: bool) -> Iterator[Report]:
@@ -34,7 +41,7 @@ def report(html: bool, png: bool, rrd: bool) -> Iterator[Report]:
         remark("left out", f"{one.file}: {one.reason}")
     yield report
     if not report.paths:
-        return show(report_text(report.findings, table, sparkline))
+        return show(report_text(report.findings))
     for path in report.paths:
         show(str(path))
     show(f"\n{next_line(report.findings.then)}")
@@ -61,3 +68,39 @@ def view() -> Iterator[Path]:
         return say(f"{path} is open")
     if code != 0:
         raise refused("run.viewer", path, exit=code)
+
+
+def report_text(findings: Findings) -> str:
+    """Return the whole report."""
+    now, history = findings.standing, findings.history
+
+    # the task, its trials, and what became better
+    head = [f"{findings.name}: {about(findings)}", "; ".join(counted(findings))]
+    if findings.effects:
+        head.append(f"adopted: {', '.join(findings.effects)}")
+    lines = [line for text in head for line in wrapped(text, "", "  ")]
+    lines += ["", *_indented(f"{value}: {what}" for value, what in improved(findings))]
+
+    # the candidates
+    if history:
+        kept, left = few(history, ROWS)
+        lines += ["", table([now.row(one) for one in kept], now.table()[1])]
+        more = f"({left} more: {rendered(NextCommand('status'), findings.folder)})"
+        spark = sparkline([tried.utility for tried in history if tried.utilities])
+        lines += _indented(filter(None, (more * bool(left), spark)))
+    lines += _indented([f"{now.outcome}: {findings.outlook}"])
+
+    # errors by state, and what was diagnosed
+    for block in error_table(findings):
+        lines += ["", table(block.rows, block.header)]
+    gap = findings.lines or [rendered(DIAGNOSE, findings.folder)]
+    lines += ["", "gap to the model", *_indented(gap)]
+    if (said := findings.told) is not None and said.rows:
+        lines += ["", table(said.rows, said.header)]
+    if findings.lost:
+        lines += ["", "left out", *_indented(f"{one.file}: {one.reason}" for one in findings.lost)]
+    return "\n".join([*lines, "", folded(rendered(findings.then, findings.folder))])
+
+
+def _indented(texts: Iterable[str]) -> list[str]:
+    return [line for text in texts for line in wrapped(text, "  ", "    ")]

@@ -8,12 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded_cli.console.terminal import sparkline, table
+from grounded_cli.report import report_text
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.gathering import RUNAWAY
 from grounded_trials.report.page import page
-from grounded_trials.report.report_text import report_text
 from reported import car, gathered
 
 __all__ = ["car"]
@@ -54,4 +53,4 @@ def test_a_report_is_made_of_any_numbers(car, tmp_path, case):
     figure = all_figures(findings)[1 + list(CASES).index(case) % 2]  # the paths, the states
     assert len(png(figure)) > 1000
     write_recording(findings, tmp_path / "r.rrd")
-    assert "next: grounded" in report_text(findings, table, sparkline)
+    assert "next: grounded" in report_text(findings)

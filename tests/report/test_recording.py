@@ -34,7 +34,7 @@ def _entities(path: Path) -> str:
 
 
 ENTITIES = """
-/paths/model_policy /paths/best/body /paths/predicted /utilities /summary /verdict
+/paths/model_policy /paths/best/body /paths/predicted /summary /verdict
 """
 
 

@@ -3,6 +3,6 @@
 Read `findings.py` first (all contents of a report, as values) and `gathering.py` (how they are
 read). `forecast.py` computes prediction errors, `bodies.py` places a robot in space, and
 `tables.py` has the sentences and tables of terminal, page and recording. `figures/` makes the
-figures (values of `grounded.figures`). `report_text.py`, `page/` and `recording.py` lay them out
-for a terminal, a browser and Rerun; `reporting.py` writes the files.
+figures (values of `grounded.figures`). `page/` and `recording.py` lay them out for a browser and
+Rerun, the command `report` for a terminal; `reporting.py` writes the files.
 """

@@ -6,7 +6,7 @@
     /trials/t0007/...         all of one trial: path, prediction, body, state, input, bias
     /data/t0003/...           the same for a log that ran no candidate
     /verdict                  what to run next, why the model was wrong, each cause
-    /utilities, /summary      utility by iteration, and a summary in Markdown
+    /summary                  a summary in Markdown
 
 There is one timeline, `time`, in seconds since the start of a trial. Numbers are logged as whole
 columns, names and colours once. The file is derived from trials and may be deleted. All recordings
@@ -133,9 +133,6 @@ class _Recorder:
         self.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
         for name, text in texts(findings).items():
             self.log(name, rr.TextDocument(text, media_type="text/markdown"))
-        values = [u for u in findings.standing.utilities if np.isfinite(u)]
-        if values:
-            self.log("utilities", rr.BarChart(values, color=COLOURS["best"]))
         self.paths()
         for drawn in over_time(findings):
             self.series(drawn)
@@ -298,29 +295,18 @@ def blueprint(findings: Findings, body: Body) -> Any:
         for figure in figures
     }
 
-    # the overview: the answer above paths, utilities and the first plots
+    # the overview: the answer above paths, summary and the first plots
     answer: Any = rrb.TextDocumentView(origin="/verdict", name="Diagnosis")
-    heights = [1, 8] if findings.diagnosis is None else [2, 5]
-    hidden = rrb.PlotLegend(visible=False)
-    utilities = rrb.BarChartView(
-        origin="/utilities", name="Utility by iteration", plot_legend=hidden
-    )
     words, view = rrb.TextDocumentView(origin="/summary", name="Summary"), camera(findings, body)
-    below = rrb.Horizontal(utilities, words, column_shares=[1, 2])
-    left = rrb.Vertical(space(view, ["/paths/**"], "Paths"), below, row_shares=[3, 2])
+    left = rrb.Vertical(space(view, ["/paths/**"], "Paths"), words, row_shares=[3, 2])
     first = [plot for name, most in FIRST.items() for plot in plots.get(name, ())[:most]]
     both = rrb.Horizontal(left, rrb.Grid(*first, grid_columns=2), column_shares=[1, 1])
-    tabs: list[Any] = [rrb.Vertical(answer, both, name="Overview", row_shares=heights)]
+    tabs: list[Any] = [rrb.Vertical(answer, both, name="Overview", row_shares=[2, 5])]
     tabs += [rrb.Grid(*plots[one.name], name=one.title) for one in figures]
     tabs.append(rrb.Tabs(*_trials(findings, view), name="By trial"))
-
-    # a workspace of logs alone opens at the logs, with the answer above them
-    only_logs = bool(findings.logs) and not findings.runs
-    shown: Any = rrb.Tabs(*tabs, active_tab=len(tabs) - 1 if only_logs else 0)
-    if only_logs:
-        shown = rrb.Vertical(answer, shown, row_shares=heights)
     return rrb.Blueprint(
-        shown,
+        # a workspace of logs alone opens at the logs
+        rrb.Tabs(*tabs, active_tab=0 if findings.runs or not findings.logs else len(tabs) - 1),
         rrb.BlueprintPanel(state="collapsed"),
         rrb.SelectionPanel(state="collapsed"),
         rrb.TimePanel(state="collapsed", timeline="time"),
