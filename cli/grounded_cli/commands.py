@@ -55,9 +55,7 @@ def cli() -> None:
 
 in_workspace(cli)
 details = flag("--details", help="Tell all notes, with codes.")
-anyway = flag(
-    "--anyway", help="Hand the candidate over even if [limits], [safety], task or model changed."
-)
+anyway = flag("--anyway", help="Even if [limits], [safety], task or model changed.")
 only_trials = option("--trials", metavar="T1,T2,...", help="Only these trials (default: all).")
 which_candidate = option("--candidate", metavar="ID", help="Which candidate was run.")
 without = option("--without", multiple=True, metavar="F1,F2,...", help="Families to exclude.")
@@ -73,22 +71,11 @@ above = FloatRange(min=0, min_open=True)
 @option("--from", "log", metavar="LOG", help="A log of your robot, of any format.")
 @option("--model", metavar="FILE", help="Your model.py, MJCF or URDF, beside --from or --blank.")
 @flag("--blank", help="No log yet: a workspace of --model, to fill in.")
-@option(
-    "--kind",
-    metavar="KIND",
-    help="car, rover, differential, boat, drone, arm, pendulum or generic.",
-)
+@option("--kind", help="car, rover, differential, boat, drone, arm, pendulum or generic.")
 @option("--inputs", metavar="A,B,...", help="Columns that are inputs (kind generic).")
 @table_layout
-@option(
-    "--dt", type=above, metavar="SECONDS", help="Control interval (the log's; 0.05 with --blank)."
-)
-@option(
-    "--actuators",
-    multiple=True,
-    metavar="FILE[:INPUT,...]",
-    help="Actuators by `export --library`.",
-)
+@option("--dt", type=above, metavar="S", help="Control interval (the log's; 0.05 with --blank).")
+@option("--actuators", multiple=True, metavar="FILE[:U,...]", help="By `export --library`.")
 @flag("--yes", help="Ask nothing: use the best guesses, marked as such.")
 @option("--example", metavar="NAME", help="Which example (see --list).")
 @flag("--list", help="List the examples.")
@@ -111,12 +98,7 @@ def init() -> None:
 @option("--lateral", type=float, help="Maximum lateral acceleration [m/s^2] (4).")
 @option("--laps", type=float, help="Laps of a circle or figure-8 (1).")
 @option("--hold", type=float, help="Time at rest at a path's end [s] (0).")
-@option(
-    "--to",
-    multiple=True,
-    metavar="STATE=VALUE",
-    help="Where it ends, or what a path keeps (a height).",
-)
+@option("--to", multiple=True, metavar="X=VALUE", help="Where it ends, or what a path keeps.")
 @option("--seconds", type=float, help="Duration of a step (5), or of a line.")
 @flag("--rest", help="Let the states that a line leaves free rest at its end, by weights.")
 @details
@@ -124,17 +106,12 @@ def target() -> None:
     """Draw the manoeuvre: line, circle, figure-8 or step.
 
     FILE is a log, read through [log], a stored trial (t0001), or a CSV with columns `t` and states.
-    Paths start from rest and keep to the given speeds and accelerations. A line with --to, or of a
-    robot with one axis, goes from [task] start to rest, in the states' own units; --seconds,
-    --speed and --accel set its pace. A step begins at [task] start. A path
-    begins at the position in [task] start, along x, and a figure-8 at its crossing: its length lies
-    45 degrees to the right of x.
+    Paths begin at rest at the position in [task] start, along x. A line with --to, or of a robot
+    with one axis, goes from [task] start to rest, in the states' own units.
 
-    The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. If
-    [task] start is empty and a stored trial begins at rest, it is set to where. [task] horizon is
-    updated, and so are the weights in [reward] state unless you chose them, and input_change of
-    inputs with [limits] if it is still what `init` wrote. Earlier trials stay available to fit and
-    diagnose; the search starts again.
+    The previous target is kept as target.csv.bak, and grounded.toml as grounded.toml.bak. [task]
+    start is set where a stored trial begins at rest, if it is empty; [task] horizon and the weights
+    that you have not chosen are updated. The search starts again.
     """
 
 
@@ -277,16 +254,9 @@ def fit() -> None:
 
 @command(cli, "diagnose")
 @only_trials
-@option(
-    "--max-effects",
-    type=IntRange(1, 12),
-    metavar="K",
-    help="Claim at most K effects (3, more for a gap).",
-)
+@option("--max-effects", type=IntRange(1, 12), metavar="K", help="Claim at most K (3, or more).")
 @without
-@option(
-    "--compare", nargs=2, metavar="A B", help="Two groups of trials, T1,T2 T3,T4: what changed."
-)
+@option("--compare", nargs=2, metavar="A B", help="Two groups, T1,T2 T3,T4: what changed.")
 @parallel("all processors")
 @flag("--details", help="Also all findings, errors, rival effects and places.")
 def diagnose() -> None:
@@ -305,13 +275,10 @@ def diagnose() -> None:
 def adopt() -> None:
     """Add diagnosed effects to the model.
 
-    They are written as `family:target` to [model] in grounded.toml. Effects that were claimed
-    together were estimated together: adopt them together. The model parameters calibrated with them
-    are written to [model] params. An effect that was not claimed can be adopted alone: its values
-    come without parameters.
-
-    The search goes on from the best policy and plans with the better model. --undo restores the
-    effects and parameters that [model] had before the last adoption; repeat it to go further back.
+    They are written to [model] in grounded.toml, and the parameters calibrated with them to [model]
+    params. Effects that were claimed together are adopted together; one that was not claimed can be
+    adopted alone, without parameters. The search goes on from the best policy with the better
+    model. --undo restores what [model] had before the last adoption.
     """
 
 
@@ -351,12 +318,10 @@ def export() -> None:
     """Write a candidate for the robot: csv, npz or json.
 
     `best` names the best candidate so far; a trial (t0007) can be written as csv or npz. A
-    candidate that must not be run any more (see `grounded run`) is refused. One that was run in an
-    earlier task is allowed if it keeps to the current [limits] and [safety].
+    candidate that must not be run any more (see `grounded run`) is refused.
 
     --model writes the model as it is now, fitted values and adopted effects, in the form that it
-    came in; all else of that file stays as it is. --library writes one actuator, from which another
-    workspace begins (`grounded init --actuators`).
+    came in. --library writes one actuator, for `grounded init --actuators`.
     """
 
 
@@ -379,12 +344,7 @@ def demo() -> None:
 
 
 @command(cli, "experiment", workspace=False)
-@argument(
-    "name",
-    type=Choice(("flight", "car", "footnote9", "theorem1")),
-    metavar="[NAME]",
-    required=False,
-)
+@argument("name", type=Choice(("flight", "car", "footnote9", "theorem1")), required=False)
 @option("--seeds", metavar="N|A-B|A,B,...", help="How many seeds, or which ones.")
 @parallel("1")
 def experiment() -> None:
@@ -407,24 +367,17 @@ labels = option("--labels", metavar="DIR", help="Where the labels are (default: 
 
 @command(challenge, "make", "challenge", workspace=False)
 @folder
-@option(
-    "--kind",
-    type=Choice(("single", "double", "none", "withheld")),
-    required=True,
-    help="How many effects; withheld: none of the library.",
-)
+@option("--kind", type=Choice(("single", "double", "none", "withheld")), required=True)
 @option("--cases", type=IntRange(1), required=True, metavar="N", help="How many.")
 @option("--seed", type=IntRange(0), required=True, metavar="S", help="Of all draws.")
 @option("--systems", default="own", metavar="G1,G2", help="Of own, kinked, mujoco.")
 @labels
-@option(
-    "--param-error",
-    type=FloatRange(0.0, 0.5),
-    metavar="E",
-    help="Relative error of parameters, 0 to 0.5.",
-)
+@option("--param-error", type=FloatRange(0.0, 0.5), metavar="E", help="Of parameters, relative.")
 def make_cases() -> None:
-    """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere."""
+    """Write N workspaces with trials into DIR, and their labels, sealed by hash, elsewhere.
+
+    The kind is how many effects they have; `withheld` is an effect that no family has.
+    """
 
 
 @command(challenge, "run", "challenge", workspace=False)
@@ -441,10 +394,7 @@ def run_cases() -> None:
 @labels
 @parallel("1")
 def score() -> None:
-    """Open the labels, score the diagnoses of DIR and compare with an oracle.
-
-    The oracle knows the effects of each case.
-    """
+    """Open the labels, score the diagnoses of DIR, and an oracle that knows the effects."""
 
 
 @command(cli, "explain", workspace=False)

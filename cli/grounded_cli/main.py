@@ -17,7 +17,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from io import StringIO, TextIOWrapper
 from pathlib import Path
-from typing import NoReturn, TextIO
+from typing import NoReturn
 
 import click
 
@@ -30,13 +30,11 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # matrices are small: thread
 
 def main() -> NoReturn:
     """Run the command line and exit with its code."""
-    gc.disable()  # until the command is imported: 80 collections on the way would find nothing
-    gc.set_threshold(30_000)  # not 700, for what it goes on to import
     atexit.register(gc.freeze)  # saves the 30 ms garbage collection at exit
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):  # show "?" for characters the encoding lacks
             stream.reconfigure(errors="replace")
-    warnings.showwarning = _noted
+    warnings.showwarning = _noted  # type: ignore[assignment]
     try:
         code, words = _run()
         if words:
@@ -54,14 +52,7 @@ def main() -> NoReturn:
     sys.exit(code)
 
 
-def _noted(
-    message: Warning | str,
-    category: type[Warning],
-    filename: str,
-    lineno: int,
-    file: TextIO | None = None,
-    line: str | None = None,
-) -> None:
+def _noted(message: object, category: object, filename: str, lineno: int, *_: object) -> None:
     """Print a warning of Python, such as NumPy's about the user's model, as a remark."""
     with suppress(OSError):
         remark("warning", f"{message} ({Path(filename).name}, line {lineno})")

@@ -10,6 +10,7 @@ def main() -> None:
     import gc
 
     gc.set_threshold(100_000, 50, 100)  # commands are short: frequent collection costs more
+    gc.disable()  # until the command is imported
     from grounded_cli.main import main as run
 
     signal(SIGINT, handler)

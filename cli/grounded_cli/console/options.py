@@ -41,9 +41,7 @@ def command(
         def call(json_: bool = False, **options: Any) -> int:
             function: Callable[..., Iterator[Any]]
             function = getattr(import_module(f"grounded_cli.{module or name}"), declared.__name__)
-            if not gc.isenabled():  # see `main`
-                gc.freeze()
-                gc.enable()
+            gc.enable()  # see `start`
             with stdout_kept():
                 telling = function(**options)
                 done = next(telling)
