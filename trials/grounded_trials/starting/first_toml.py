@@ -144,11 +144,10 @@ def held_first(
 ) -> dict[str, float] | None:
     """Return the states in which a robot stands at the start of a log, and the inputs holding it.
 
-    States at 0 are not named. If no input has to hold it, none is named: inputs then count as 0
-    before a run, which is also what is sent after it; it may then stand for a moment only
-    (`BEGAN`). A robot that drives in a plane may start anywhere, so that no state is named without
-    such an input. Returns None if the robot moves or an input changes. Also returns None for a
-    model without a speed, since a slow drift could not be detected.
+    States at 0 are not named, nor inputs that need not hold it: these then count as 0 before a run,
+    which is also what is sent after it. Without any it may stand for a moment only (`BEGAN`); and
+    one that drives in a plane may start anywhere, so that no state is named. Returns None if the
+    robot moves or an input changes, and for a model without a speed, whose drift could be slow.
 
     Args:
         model: the model of the states and inputs.
@@ -167,12 +166,12 @@ def held_first(
     )
     trial = Trial(x, u, dt, model.state_names, model.input_names)
     long, brief = (standstill(model, trial, seconds, ranges) for seconds in (STOOD, BEGAN))
-    if long is not None and long.needs.any():
-        held = zip(model.input_names, long.inputs.tolist(), long.needs, strict=True)
-        return _away(model, long) | {name: u for name, u, needed in held if needed}
-    if brief is None or brief.needs.any() or has_plane(model):
+    stand = long or brief
+    if stand is None or (long is None and stand.needs.any()):
         return None
-    return (long and _away(model, long)) or _away(model, brief)
+    each = zip(model.input_names, stand.inputs.tolist(), stand.needs, strict=True)
+    held = {name: u for name, u, needed in each if needed}
+    return _away(model, stand) | held if held or not has_plane(model) else None
 
 
 def _away(model: Model, stand: Stand) -> dict[str, float]:

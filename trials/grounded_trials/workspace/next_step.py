@@ -192,10 +192,11 @@ def to_learn_from(workspace: Folder) -> NextCommand:
     model = workspace.base_model
     u = np.append(np.zeros((1, model.m)), np.eye(model.m), axis=0)
     x = np.zeros((len(u), model.n))
-    with np.errstate(all="ignore"):
+    with suppress(GroundedError), np.errstate(all="ignore"):  # `diagnose` reports a faulty model
         after = model.system.step(x, u, model.values, workspace.config.task.dt)
-    fitted = not any(one.uncertain for one in model.params.values()) or (after != after[0]).any()
-    return DIAGNOSE if fitted else FIT
+        if any(one.uncertain for one in model.params.values()) and (after == after[0]).all():
+            return FIT
+    return DIAGNOSE
 
 
 def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextCommand:

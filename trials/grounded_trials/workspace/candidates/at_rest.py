@@ -10,6 +10,7 @@ gravity). A position that may be anywhere is for the user to choose.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -98,9 +99,10 @@ def standstill(
     # By how much the model moves there with all inputs, and without each, in parts of the ranges.
     u = held * np.append(np.ones((1, model.m)), 1 - np.eye(model.m), axis=0)
     x = np.tile(at, (len(u), 1))
-    with np.errstate(all="ignore"):
+    moves = np.zeros(len(u))
+    with suppress(GroundedError), np.errstate(all="ignore"):  # a faulty model needs none
         moved = model.difference(model.system.step(x, u, model.values, trial.dt), x)
-    moves = np.linalg.norm(moved / np.where(whole > 0, whole, 1.0), axis=1)
+        moves = np.linalg.norm(moved / np.where(whole > 0, whole, 1.0), axis=1)
     needs &= moves[1:] > moves[0]
     return Stand(at, held, STEADY * whole, needs, trial.id)
 
