@@ -192,8 +192,7 @@ class _Table:
             return
         name = self._name(role, number, called)
         if name or (number.moves and number.field.low is not None):
-            kind = 1.0 + 0.9 * words.has_words(number.path, role.name) * (not name)
-            kind *= role.sent and number.command and number.moves
+            kind = 1.0 * (role.sent and number.command and number.moves)
             self.add(role.name, number.path, name + self._unit(role, number) + kind)
 
     def _name(self, role: _Role, number: _Number, called: Sequence[str]) -> float:

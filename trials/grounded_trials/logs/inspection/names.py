@@ -128,18 +128,6 @@ def name_points(
     return best + (0.5 if is_input else -2.0) * commanded + 0.5 * (topic.stamped and not is_input)
 
 
-def has_words(path: str, name: str) -> bool:
-    """Return whether the last name of a path has all words of a name, and is not their rate.
-
-    So `voltage` is `motor_voltage`, but not `voltage_rate`.
-    """
-    last = re.split(r"[./]", path.lower())[-1]
-    said = {*_WORD.findall(last)}
-    words = {*_WORD.findall(name.lower())}
-    long = bool(words) and all(len(word) > 1 for word in words)
-    return long and words <= said and not (said - words) & _RATES
-
-
 def _fit(called: Sequence[str], inside: str, topic: str) -> float:
     """Score how well a name fits: by the end of the path, or by the topic if that is generic."""
     best = 0.0
