@@ -245,7 +245,7 @@ class Recording:
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if trial is not None and fit is not None:
-                alike = fit.alike and not fit.late and _close(policy, trial)
+                alike = fit.alike and not fit.late
                 opens = alike or fit.opens
                 between = seconds < on_step
                 found.append(Start(seconds, float(apart[k]), alike, opens, between, loose))
@@ -327,20 +327,6 @@ class Recording:
         if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
             return start, loose
         return start - float(np.clip(share, 0.0, 1.0)) * row, loose
-
-
-def _close(policy: Policy, trial: Trial) -> bool:
-    """Return whether commands differ by a small share of what unrelated ones differ by.
-
-    A search over a whole log finds coincidental fits, so the test is stricter than `follows`, which
-    allows states of any age within two steps.
-    """
-    T = min(trial.finite_steps, policy.horizon)
-    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    asked = policy.commands(trial.states[None, :T], policy.past)[0]
-    usual = sum(np.abs(u - u.mean(axis=0)).mean(axis=0) for u in (sent, asked))
-    finest = FINE * np.abs(policy.feedforward).max(axis=0)
-    return bool((np.abs(sent - asked).mean(axis=0) <= UNLIKE * usual + finest).all())
 
 
 def recording(
