@@ -243,7 +243,10 @@ class Salvage:
                 before = opcode
             self._crc, pos = zlib.crc32(self.data[pos:stop], self._crc), stop
         yield from self._cut(self.data[pos:])
-        self.losses.append(found("file.cut", byte=pos, index=int(self._ended)))
+        if self.data[-len(MAGIC) :] == MAGIC:  # the file is whole, the record's head is not
+            self.losses.append(found("file.lost", bytes=self.size - pos, byte=pos))
+        else:
+            self.losses.append(found("file.cut", byte=self.size, index=int(self._ended)))
 
     def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
         try:
