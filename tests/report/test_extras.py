@@ -59,7 +59,7 @@ def test_what_is_there_is_imported():
         ),
         (
             "grounded.search.improve",
-            ("grounded.search.first_policy", "grounded.search.mispred"),
+            ("grounded.search.first_policy",),
         ),
     ],
 )
