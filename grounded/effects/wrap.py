@@ -303,11 +303,12 @@ def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
     take another one's rate for the model's own.
     """
     base, instant, clocks = plain_step(model), _instant(model), _clocks(effects)
+    bare = getattr(model.step, "bare", model)
     limits = [e for e in effects if _family(e).parts]
     rates = [e for e in effects if not _family(e).parts]
     soft, dry = ([e for e in rates if _family(e).dry == one] for one in (False, True))
     needs_own = any(_family(e).needs_own for e in rates)
-    tied = {n: k for n in model.state_names if (k := partner(model, n))}
+    tied = {n: k for n in bare.state_names if (k := partner(bare, n))}
     losing = joined(model, LossFamily)[1]
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
