@@ -76,9 +76,9 @@ def placed(found, families):
     for place, effect in enumerate(named, 1):
         if effect.partition(":")[0] in families:
             return f"named, {place} of {len(named)}"
-    tied = {e.partition(":")[0] for group in found.indistinguishable for e in group}
-    alike = {one.like.partition(":")[0] for one in found.lookalikes}
-    return "in the named group" if (tied | alike) & set(families) else "not named"
+    groups = (*found.indistinguishable, *found.equivalent)
+    tied = {e.partition(":")[0] for group in groups for e in group}
+    return "in the named group" if tied & set(families) else "not named"
 
 
 def told(name, found, seconds):

@@ -112,7 +112,6 @@ def place_of(cause: str, found: Diagnosis) -> str:
         return "claimed"
     groups = (*found.indistinguishable, *found.equivalent)
     tied = [name for group in groups if {*group} & {*found.effects} for name in group]
-    tied += [one.like for one in found.lookalikes]
     if any(true.match(name) for name in tied):
         return "tied"
     ranks = (k for k, row in enumerate(found.ranking, 1) if true.match(row.effect))
