@@ -1,97 +1,90 @@
-"""Time the solver on its two problems, and whole commands; run by hand.
+"""Compare the solver with its peers, as time ratios within one run; run by hand.
 
-    python benchmarks/run.py solve      two problems to the best known cost, to a part in 10^4
-    python benchmarks/run.py process    whole commands
+    python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
+    python benchmarks/run.py --peers /tmp/peers/bin/python     solve alone, beside the peers
+    python benchmarks/run.py process                           whole commands
 
-    car       n = 6 + 2 previous inputs, m = 2, H = 200: 10 s on a circle at 20 Hz, without the
-              model's stall and braking, so that it is smooth
-    aircraft  n = 12 + 4, m = 4, H = 3000: the 60 s figure-8 of section 5.1 at 50 Hz
-
-Inputs have no limits. Times are CPU times, the least of several.
+Every solver gets the same problem (`peers.py`), the same start, and has to reach the best known
+cost to a part in 10^4. Times are CPU times of the solve alone, least of several; building a
+problem, tracing and compiling are listed separately.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import platform
+import subprocess
 import tempfile
-from dataclasses import replace
 from pathlib import Path
 
 import llvmlite
 import numpy as np
 from helpers import fastest, grounded, python
+from peers import CLOSE, case
 
 from grounded.compile import DescentOptions
-from grounded.experiments.car_tasks import car_task
-from grounded.experiments.figure8 import flight_task
-from grounded.models import aircraft, car
-from grounded.search.first_guess import first_guess
 from grounded.solve.ddp import solve
 
 HERE = Path(__file__).parent
 ROOM = os.pathsep.join(str(HERE.parent / folder) for folder in ("", "cli", "trials"))
-CLOSE = 1e-4  # relative distance from the best known cost at which the solver is done
 
 
-def smooth_dynamics(s, a, p):
-    delta_dot = (p.a1 * a.steering + p.b1 - s.delta) / p.tau_delta
-    v_dot = (p.a2 * a.throttle + p.b2 - s.v) / p.tau_v
-    cd, sd = np.cos(s.delta), np.sin(s.delta)
-    return {
-        "delta": delta_dot,
-        "v": v_dot,
-        "x": s.v * cd * np.cos(s.psi),
-        "y": s.v * cd * np.sin(s.psi),
-        "psi": s.v * sd / p.L,
-        "psi_rate": (v_dot * sd + s.v * cd * delta_dot) / p.L,
-    }
+def our_row(case):
+    """Return our time, iterations and cost; an iteration is linearisation, sweep and rollout.
 
-
-SMOOTH = ("a1", "b1", "a2", "b2", "tau_delta", "tau_v", "L")
-
-
-def case(name):
-    """Return a problem, and the inputs (H, m) that the solver starts from."""
-    if name == "car":
-        params = {name: car.model.params[name] for name in SMOOTH}
-        model = replace(car.model, name="smooth car", params=params, derivative=smooth_dynamics)
-        task = replace(car_task("circle", model), latency=np.zeros(2))
-    else:
-        task = flight_task(aircraft.model)
-    free = np.full(task.model.m, np.inf)
-    problem = replace(task.problem(), low=-free, high=free, smoothing=0.0)
-    if name == "car":  # the inputs of the steady circle, open loop: about 0.5 m off at the end
-        return problem, np.tile([0.32, 0.55], (problem.horizon, 1))
-    guess = first_guess(task)
-    run = problem.system.rollout(problem, guess.inputs, guess.gain, guess.z[:-1])
-    return problem, run.u[0]
-
-
-def solve_part():
-    """Print time, iterations and cost of each problem.
-
-    An iteration is linearisation, sweep and rollout, timed inside a solve, without the first
-    rollout and the last sweep.
+    An iteration is timed inside a solve, without the first rollout and the last sweep.
     """
-    for name in ("car", "aircraft"):
-        problem, u = case(name)
 
-        def ours(iterations, tolerance=0.0, problem=problem, u=u):
-            options = DescentOptions(max_iterations=iterations, tolerance=tolerance)
-            return solve(problem, u, options=options)
+    def ours(iterations, tolerance=0.0):
+        options = DescentOptions(max_iterations=iterations, tolerance=tolerance)
+        return solve(case.problem, case.u, options=options)
 
-        best = ours(50, 1e-10).cost
-        count = next(i for i in range(1, 50) if ours(i).cost <= best * (1 + CLOSE))
-        ms, first = (1e3 * fastest(lambda i=i: ours(i), 50) for i in (count, 0))
-        print(
-            f"\n{name}: H = {problem.horizon}, nz = {problem.nz}: {ms:.3f} ms, {count} iterations "
-            f"of {(ms - first) / count:.3f} ms, cost {ours(count).cost:.6g}"
-        )
+    best = ours(50, 1e-10).cost
+    iterations = next(i for i in range(1, 50) if ours(i).cost <= best * (1 + CLOSE))
+    ms, first = (1e3 * fastest(lambda i=i: ours(i), 50) for i in (iterations, 0))
+    return best, {
+        "peer": "grounded", "case": case.name, "ms": ms, "iterations": iterations,
+        "cost": ours(iterations).cost, "iteration_ms": (ms - first) / iterations,
+    }  # fmt: skip
 
 
-def process_part():
+def solve_part(options):
+    """Print a row for each solver and problem."""
+    with tempfile.TemporaryDirectory() as folder:
+        for one in map(case, ("car", "aircraft")):
+            best, ours = our_row(one)
+            print(f"\n{one.name}: H = {one.problem.horizon}, nz = {one.problem.nz}")
+            show(ours, ours)
+            path = str(one.save(Path(folder)))
+            for peer in ("crocoddyl", "casadi", "jax") if options.peers else ():
+                command = [options.peers, "peers.py", peer, path, repr(best)]
+                environment = os.environ | {"PYTHONPATH": ROOM}
+                done = subprocess.run(
+                    command, cwd=HERE, env=environment, capture_output=True, text=True
+                )
+                if done.returncode == 0:
+                    show(json.loads(done.stdout.strip().splitlines()[-1]), ours)
+                else:
+                    print(f"  {peer:<24} not measured: {done.stderr.strip().splitlines()[-1:]}")
+
+
+def show(row, ours):
+    text = f"  {row['peer']:<24} {row.get('version', ''):<8} {row['ms']:10.3f} ms"
+    text += f"  {row['iterations']} iterations, cost {row['cost']:.6g}"
+    text += f", ratio {row['ms'] / ours['ms']:.1f}"
+    if "backward_ms" in row:
+        alone, ratio = row["backward_ms"], row["backward_ms"] / ours["iteration_ms"]
+        text += f"; its backward pass alone {alone:.3f} ms, {ratio:.1f} of our iterations"
+    if "iteration_ms" in row:
+        text += f"; an iteration {row['iteration_ms']:.3f} ms"
+    if "build_s" in row:
+        text += f"; builds for {row['build_s']:.1f} s"
+    print(text)
+
+
+def process_part(options):
     """Time whole processes: `grounded propose` on the aircraft, cold and warm, and importing.
 
     Cold: no kernel in the cache. Python's own compiled modules are always there, as after the
@@ -133,12 +126,14 @@ PARTS = {"solve": solve_part, "process": process_part}
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--peers", help="a Python that has the peers")
     parser.add_argument("parts", nargs="*", help=f"of {', '.join(PARTS)}")
+    options = parser.parse_args()
     versions = f"NumPy {np.__version__}, llvmlite {llvmlite.__version__}"
     machine = platform.processor() or platform.machine()
     print(f"Python {platform.python_version()}, {versions}, {machine}")
-    for part in parser.parse_args().parts or PARTS:
-        PARTS[part]()
+    for part in options.parts or PARTS:
+        PARTS[part](options)
 
 
 if __name__ == "__main__":

@@ -6,5 +6,6 @@ pushing      a block pushed over a floor (MuJoCo)
 aircraft     a Cessna 172 (JSBSim)
 cars         a single-track drift car and a multi-body car (CommonRoad)
 setups       one name for each system and what is withheld from its crude model
-study        trials to 90, 97, 99 % of the gap to the best utility known (optima.json)
+optimum      the best utility known, from the simulator itself; cached in optima.json
+study        trials to 90, 97, 99 % of the gap
 """

@@ -1,6 +1,6 @@
 """Run the foreign bench.
 
-    python -m benchmarks.foreign [--only NAME] [--json] [--adopt N] [--list]
+    python -m benchmarks.foreign [--only NAME] [--json] [--optimum] [--adopt N] [--list]
 
 Needs mujoco, jsbsim, commonroad-vehicle-models, and the packages gymnasium, dm_control, robosuite
 for the files that they ship (`pip install --no-deps` does); set-ups of a missing one are skipped
@@ -13,6 +13,7 @@ import argparse
 import json
 import sys
 
+from benchmarks.foreign.optimum import optimum, remember
 from benchmarks.foreign.setups import SETUPS, setup
 from benchmarks.foreign.study import measured, results
 
@@ -21,6 +22,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.foreign", description=__doc__)
     parser.add_argument("--only", action="append", help="set-ups whose names begin so")
     parser.add_argument("--json", action="store_true", help="one JSON document on stdout")
+    parser.add_argument("--optimum", action="store_true", help="compute optima.json, which is slow")
     parser.add_argument("--adopt", type=int, default=0, help="diagnose after so many trials")
     parser.add_argument("--list", action="store_true", help="the names")
     asked = parser.parse_args()
@@ -36,8 +38,11 @@ def main() -> int:
             say(f"{name}: left out, {error}")
             continue
         say(f"{name}: {one.withheld} withheld ...")
-        rows.append(measured(one, asked.adopt))
-        say(results(rows[-1:]).splitlines()[-1])
+        if asked.optimum:
+            remember(name, *optimum(one, say))
+        else:
+            rows.append(measured(one, asked.adopt))
+            say(results(rows[-1:]).splitlines()[-1])
     if asked.json:
         print(json.dumps([row.to_json() for row in rows], indent=1))
     elif rows:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.foreign.robots import Robot, minimum_jerk, task_of
+from benchmarks.foreign.robots import Robot, minimum_jerk, task_of, with_true_model
 from grounded.model import Model
 from grounded.models import arm, cart_pole
 from grounded.task import Task
@@ -51,9 +51,12 @@ class MujocoRobot:
         self.mj.mj_step(self.model, self.data)
 
 
-def robot_of(task: Task, xml: Any, delay: float = 0.0) -> Robot:
-    """Return the robot of an XML, whose measured states are the task's."""
-    return Robot(MujocoRobot(xml, np.asarray(task.start)), delay)
+def mujoco_setup(task: Task, xml: Any, delay: float = 0.0) -> tuple[Robot, Task]:
+    """Return the robot of an XML, and the task planned in the same XML."""
+    from grounded.adapters import mujoco
+
+    truth = with_true_model(task, mujoco.model(xml), delay)
+    return Robot(MujocoRobot(xml, np.asarray(task.start)), delay), truth
 
 
 # Cart-pole: from hanging to upright in three or four seconds.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.foreign.mechanisms import MujocoRobot
-from benchmarks.foreign.robots import Robot, minimum_jerk, task_of
+from benchmarks.foreign.robots import Robot, minimum_jerk, task_of, with_true_model
 from grounded.model import Model, Param
 from grounded.task import Task
 
@@ -108,7 +108,14 @@ def task() -> Task:
     )
 
 
-def robot(**what: float) -> Robot:
-    """Return the robot; velocities, the block's height and tilt are not measured."""
-    xml = PLANE.format(**{"mass": 0.5, "floor": 0.35, "tip": 0.4} | what)
-    return Robot(MujocoRobot(xml, np.zeros(5), columns=list(range(5))))
+def setup(**what: float) -> tuple[Task, Robot, Task]:
+    """Return the task, the robot, and the task planned in MuJoCo.
+
+    Velocities, the block's height and tilt are not measured.
+    """
+    from grounded.adapters import mujoco
+
+    asked, xml = task(), PLANE.format(**{"mass": 0.5, "floor": 0.35, "tip": 0.4} | what)
+    truth = mujoco.model(xml)
+    robot = Robot(MujocoRobot(xml, np.zeros(truth.n), columns=list(range(5))))
+    return asked, robot, with_true_model(asked, truth)

@@ -8,7 +8,7 @@ queue of whole simulation steps between the policy and the simulator.
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -84,6 +84,30 @@ class Robot:
         """Return the measured states (n,)."""
         x = self.simulator.measure()
         return x if self.noise is None else x + self.noise * self.rng.standard_normal(len(x))
+
+
+def with_true_model(task: Task, model: Model, delay: float = 0.0) -> Task:
+    """Return the same task planned in the simulator itself; its first states are the task's.
+
+    States that the crude model lacks (activations) start at zero and have no weight.
+    """
+    more = model.n - task.model.n
+    nothing, free = np.zeros(more), np.full(more, np.inf)
+    return replace(
+        task,
+        model=model,
+        target=np.hstack([task.target, np.full((task.horizon + 1, more), np.nan)]),
+        reward=Reward(
+            np.append(task.reward.state, nothing),
+            np.append(task.reward.terminal, nothing),
+            task.reward.input,
+            task.reward.input_change,
+        ),
+        start=np.append(task.start, nothing),
+        latency=np.full(task.model.m, delay),
+        safety_low=np.append(task.safety_low, -free),
+        safety_high=np.append(task.safety_high, free),
+    )
 
 
 def task_of(

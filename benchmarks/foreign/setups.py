@@ -9,15 +9,20 @@ import numpy as np
 
 from benchmarks.foreign import aircraft, cars, pushing
 from benchmarks.foreign import mechanisms as mech
-from benchmarks.foreign.robots import Robot
+from benchmarks.foreign.robots import Robot, with_true_model
+from grounded.adapters import mujoco
 from grounded.challenge.mechanism import arm_xml, cart_xml
+from grounded.policy import Policy
+from grounded.search.candidate import Candidate
 from grounded.task import Task
+from grounded.trial import Trial
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
     """One system and what is withheld from its crude model.
 
+    truth: the same task planned in the simulator, where the simulator can be a Model.
     cause: pattern of the names that a diagnosis may give to what is withheld.
     """
 
@@ -25,22 +30,31 @@ class Setup:
     withheld: str
     task: Task
     robot: Robot
+    truth: Task | None = None
     cause: str = ""
+
+    def run(self, candidate: Candidate) -> Trial:
+        """Run the candidate once on the robot."""
+        return self.robot.run(candidate.policy)
+
+    def real(self, policy: Policy, run: int) -> Trial:
+        """Run a policy on the robot; every run is the same."""
+        return self.robot.run(policy)
 
 
 def cart(name: str, withheld: str, kind: str = "gentle", **what: object) -> Setup:
     task = mech.cart_task(kind)
-    return Setup(name, withheld, task, mech.robot_of(task, cart_xml(**what)))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, cart_xml(**what)))
 
 
 def arm(name: str, withheld: str, delay: float = 0.0, **what: object) -> Setup:
     task = mech.arm_task()
-    return Setup(name, withheld, task, mech.robot_of(task, arm_xml(**what), delay))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, arm_xml(**what), delay))
 
 
 def arm7(name: str, withheld: str, **what: float) -> Setup:
     task = mech.arm7_task()
-    return Setup(name, withheld, task, mech.robot_of(task, mech.arm7_xml(**what)))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**what)))
 
 
 def shipped(
@@ -53,11 +67,15 @@ def shipped(
     columns = [*joints, *(compiled.nq + j for j in joints)]  # hinges and slides only
     simulator = mech.MujocoRobot(compiled, np.asarray(task.start), columns)
     scatter = noise * np.repeat([1.0, 10.0], len(joints)) if noise else None  # [rad], [rad/s]
-    return Setup(name, withheld, task, Robot(simulator, delay, scatter), cause)
+    truth = None
+    if not noise:
+        model = mujoco.model(compiled, without="unmoved")
+        truth = with_true_model(task, model, delay)
+    return Setup(name, withheld, task, Robot(simulator, delay, scatter), truth, cause)
 
 
 def block(name: str, withheld: str, **what: float) -> Setup:
-    return Setup(name, withheld, pushing.task(), pushing.robot(**what))
+    return Setup(name, withheld, *pushing.setup(**what))
 
 
 def cessna(name: str, withheld: str, **what: float) -> Setup:

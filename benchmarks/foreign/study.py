@@ -7,14 +7,13 @@ with nothing withheld there is no gap.
 
 from __future__ import annotations
 
-import json
 import re
 import time
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
+from benchmarks.foreign.optimum import known
 from benchmarks.foreign.setups import Setup
 from benchmarks.helpers import table
 from grounded.diagnosis.diagnose import diagnose
@@ -27,7 +26,6 @@ from grounded.search.step_size import SearchOptions
 from grounded.trial import Trial
 from grounded_trials.workspace.adopted import planner_of
 
-OPTIMA = json.loads(Path(__file__).with_name("optima.json").read_text())
 SHARES = (0.9, 0.97, 0.99)
 CLOSE = 0.005
 
@@ -81,13 +79,11 @@ def measured(setup: Setup, after: int = 0) -> Row:
             if made is None:
                 break
             candidates += [made] * proposal.is_new
-            trials.append(
-                replace(setup.robot.run(made.policy), candidate=made.id, id=f"t{len(trials)}")
-            )
+            trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
     except Exception as error:
         ended = f"{type(error).__name__}: {error}"
     utilities = [task.utility(trial) for trial in trials]
-    best = OPTIMA.get(setup.name, {}).get("utility")
+    best = known().get(setup.name, {}).get("utility")
     return Row(
         name=setup.name,
         withheld=setup.withheld,
@@ -124,7 +120,7 @@ def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple
         return (None,) * len(SHARES)
     base = utilities[0]
     if not np.isfinite(base):
-        base = setup.task.utility(setup.robot.run(held(setup)))
+        base = setup.task.utility(setup.real(held(setup), 0))
     so_far = np.maximum.accumulate(utilities)
     levels = [min(best - (1 - share) * (best - base), best - CLOSE * abs(best)) for share in SHARES]
     return tuple(
