@@ -48,8 +48,8 @@ class Stand:
         states: their medians in the second half of that time (n,).
         inputs: the same of the inputs (m,): a controller may sag at first.
         steady: changes of the states that count as none (n,).
-        needs: inputs that hold it there (m,) bool: constant, or beyond what trembles, and without
-            which the model moves more. A throttle held while the motors are off is none.
+        needs: inputs that hold it there (m,) bool: constant, or beyond what trembles. An input
+            without which the model moves less is none: a throttle held while the motors are off.
         trial: its id.
     """
 
@@ -100,10 +100,10 @@ def standstill(
     u = held * np.append(np.ones((1, model.m)), 1 - np.eye(model.m), axis=0)
     x = np.tile(at, (len(u), 1))
     moves = np.zeros(len(u))
-    with suppress(GroundedError), np.errstate(all="ignore"):  # a faulty model needs none
+    with suppress(GroundedError), np.errstate(all="ignore"):  # a faulty model tells of none
         moved = model.difference(model.system.step(x, u, model.values, trial.dt), x)
         moves = np.linalg.norm(moved / np.where(whole > 0, whole, 1.0), axis=1)
-    needs &= moves[1:] > moves[0]
+    needs &= moves[1:] >= moves[0]
     return Stand(at, held, STEADY * whole, needs, trial.id)
 
 
