@@ -57,6 +57,15 @@ def test_the_old_target_is_back_if_the_settings_can_t_be_written(w, monkeypatch)
     assert (w.folder / "target.csv").read_bytes() == before
 
 
+def test_the_settings_are_as_before_if_the_target_can_t_be_written(w):
+    (w.folder / "target.csv").unlink()
+    (w.folder / "target.csv").mkdir()
+    before = files(w)
+    with pytest.raises(GroundedError, match=r"target\.csv"):
+        w.target({"theta": LINE})
+    assert files(w) == before
+
+
 def test_the_old_target_is_kept(w):
     old = (w.folder / "target.csv").read_bytes()
     path = w.target({"theta": list(LINE)})

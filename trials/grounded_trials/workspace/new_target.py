@@ -89,7 +89,7 @@ def replace_target(
 
     Raises:
         GroundedError: if the columns are no target of the model, see `checked`; if grounded.toml
-            has other errors; or if a file can't be written.
+            has other errors; or if a file can't be written. The files are then as before.
     """
     columns = checked(columns, model)
     rows = len(next(iter(columns.values())))
@@ -98,7 +98,7 @@ def replace_target(
     weights = {name: float(f"{w:.6g}") for name, w in each.items() if name not in only_at_end}
     name = config.task.target or "target.csv"
     path = config.file.parent / name
-    usual, given = dict[str, float](), dict[str, Array]()
+    usual, given, old = dict[str, float](), dict[str, Array](), None
     if path.is_file():
         try:
             old = path.read_bytes()
@@ -110,17 +110,24 @@ def replace_target(
             usual = usual_weights(model, given)
         write_atomically(path.with_name(path.name + ".bak"), old)
         write_atomically(config.file.with_name(config.file.name + ".bak"), config.file.read_bytes())
-    set_target(
-        config.file,
-        name,
-        rows - 1,
-        weights,
-        usual,
-        limited_changes(config, model),
-        terminal,
-        [one for one in given if one not in columns],
-    )
     write_target(path, config.task.dt, columns)
+    try:
+        set_target(
+            config.file,
+            name,
+            rows - 1,
+            weights,
+            usual,
+            limited_changes(config, model),
+            terminal,
+            [one for one in given if one not in columns],
+        )
+    except BaseException:
+        if old is None:
+            path.unlink(missing_ok=True)
+        else:
+            write_atomically(path, old)
+        raise
     return path
 
 
