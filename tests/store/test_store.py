@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import shutil
 from pathlib import Path
 
@@ -79,6 +81,23 @@ def test_ingesting_again_replaces_a_damaged_file_and_keeps_the_damaged_one(tmp_p
     assert not healed.known and healed.path == added.path and store.read("t0001") == b"good"
     assert (tmp_path / (added.path.name + ".damaged")).read_bytes() == b"gosd"
     assert store.verify() == () and [s.number for s in store.list()] == [1, 2]
+
+
+def test_a_damaged_file_stays_if_its_contents_can_t_be_written_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = Store(tmp_path)
+    added = store.add(b"good")
+    added.path.chmod(0o644)
+    added.path.write_bytes(b"gosd")
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "full")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(GroundedError):
+        store.add(b"good")
+    assert [one.path for one in store.list()] == [added.path] and len(store.verify()) == 1
 
 
 def test_unknown_names(tmp_path: Path) -> None:

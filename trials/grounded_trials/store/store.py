@@ -18,6 +18,7 @@ import errno
 import hashlib
 import os
 import re
+import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -162,8 +163,10 @@ class Store:
                     same = Stored(self.folder / name, number, digest[:DIGITS])
                 elif whole:
                     return Added(**vars(same), sha256=digest, known=True)
-                else:
-                    same.path.replace(same.path.with_name(same.path.name + ".damaged"))
+                else:  # a copy, so that the damaged file stays if the disk is full
+                    aside = same.path.with_name(same.path.name + ".damaged")
+                    aside.unlink(missing_ok=True)
+                    shutil.copyfile(same.path, aside)
                 _place(data, same.path, mode=0o444)
             except OSError as error:
                 raise self._unwritable(error) from None
