@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.checks import numbers, of_shape, positive, wrong
-from grounded.frozen import Array, readonly, resampled_noise, wrapped
+from grounded.frozen import Array, calm, readonly, resampled_noise, wrapped
 
 MAX_GAP_S = 1.0  # a longer gap ends a trial
 LAST = 2  # steps at the end of a run that may be missing and are extrapolated,
@@ -137,7 +137,8 @@ class Trial:
         known: dict[int, Array] = vars(self).setdefault("_noise", {})
         length = len(self.states) if rows is None else min(rows, len(self.states))
         if length not in known:
-            known[length] = readonly(resampled_noise(self.states[:length]))
+            settled = calm(self.inputs[: length - 1])
+            known[length] = readonly(resampled_noise(self.states[:length], settled))
         return known[length]
 
     def repeats(self, other: Trial) -> bool:
