@@ -18,6 +18,7 @@ import contextlib
 import ctypes
 import hashlib
 import os
+import platform
 import sys
 import threading
 import warnings
@@ -48,7 +49,7 @@ def _host() -> tuple[str, str]:
 
 @cache
 def _fits() -> str:
-    """What makes compiled code fit here: LLVM's version and the CPU, as Linux or LLVM tells it."""
+    """What makes code fit here: LLVM's version, the system, the CPU as Linux or LLVM tells it."""
     import llvmlite
 
     said = ""
@@ -58,7 +59,8 @@ def _fits() -> str:
     if not said:
         name, features = _host()
         said = " ".join([name, *(one for one in features.split(",") if one.startswith("+"))])
-    return f"{llvmlite.__version__} {said}"
+    # the same CPU may run or emulate other systems, which share a home
+    return f"{llvmlite.__version__} {sys.platform} {platform.machine()} {sys.maxsize} {said}"
 
 
 def _machine() -> Any:
