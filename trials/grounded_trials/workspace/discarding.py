@@ -83,15 +83,20 @@ def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.log_faults import log_faults  # slow to load
+    from grounded_trials.workspace.intake.gone_wrong import went_as_planned  # slow to load
+    from grounded_trials.workspace.intake.log_faults import log_faults
 
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
     if not workspace.fits(trial):
         return None
+    whole = interpolate_gaps(trial).trial
     if "source" in meta and (
         read_otherwise(meta, workspace.log_mapping)
-        or any(one.code in COLUMNS for one in log_faults(workspace, interpolate_gaps(trial).trial))
+        or (
+            not went_as_planned(workspace, whole)
+            and any(one.code in COLUMNS for one in log_faults(workspace, whole))
+        )
     ):
         own = standing_in(workspace).outstanding if trial.candidate else None
         waits = own is not None and own.id == trial.candidate

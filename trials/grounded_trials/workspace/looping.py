@@ -23,6 +23,7 @@ from grounded_trials.workspace.candidates.proposing import Proposed, Status, pro
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.gone_wrong import went_as_planned
 from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
 
 MOST_TRIALS = 100_000
@@ -99,10 +100,12 @@ def learn_in(
 
 def _odd_before(workspace: Folder) -> bool:
     """Return whether the last run's log had faults too, so that the user has chosen to go on."""
+    runs = [trial for trial in workspace.task_trials() if trial.candidate]
+    if not runs or went_as_planned(workspace, runs[-1]):
+        return False
     from grounded_trials.workspace.intake.log_faults import log_faults  # slow to load
 
-    runs = [trial for trial in workspace.task_trials() if trial.candidate]
-    return bool(runs) and bool(log_faults(workspace, runs[-1]))
+    return bool(log_faults(workspace, runs[-1]))
 
 
 def next_in(

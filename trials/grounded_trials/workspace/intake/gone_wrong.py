@@ -293,6 +293,14 @@ def as_before(task: Task, own: Candidate, run: Trial) -> bool:
     return bool(all(inside) and (end <= known).all())
 
 
+def went_as_planned(workspace: Folder, trial: Trial) -> bool:
+    """Return whether a trial, with gaps bridged, is a run as planned, see `as_planned`."""
+    if trial.candidate not in workspace.candidate_ids():
+        return False
+    own, _ = workspace.candidate(trial.candidate)
+    return as_planned(own, trial.until(own.policy.horizon))
+
+
 def shown_by(
     workspace: Folder,
     trial: Trial,
@@ -314,10 +322,8 @@ def shown_by(
         doubted: its candidate was named against its commands.
         silent: states without a value in the rest of its log, where others have some.
     """
-    whole, ran = interpolate_gaps(trial).trial, trial.candidate
-    known = ran in workspace.candidate_ids()
-    candidate = workspace.candidate(ran)[0] if known else None
-    planned = candidate is not None and as_planned(candidate, whole.until(candidate.policy.horizon))
+    whole = interpolate_gaps(trial).trial
+    planned = went_as_planned(workspace, whole)
     if not planned:
         from grounded_trials.workspace.intake.log_faults import log_faults
 
