@@ -17,7 +17,6 @@ from grounded.search.standing import Ending, Phase
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates import trust
 from grounded_trials.workspace.candidates.exporting import to_run
-from grounded_trials.workspace.candidates.first_plan import left_open
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,
@@ -160,6 +159,8 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
         notes = [one.also(instead=candidate.id) for one in notes]
     first: list[Finding] = []
     if not now.trials and (candidate is None or proposal.is_new):
+        from grounded_trials.workspace.candidates.first_plan import left_open  # not for `status`
+
         first = left_open(workspace, proposal)
         notes += first
     asked = next((one.then for one in first if one.then), None)
