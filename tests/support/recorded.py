@@ -58,8 +58,26 @@ def record(
         rows.append([1000 + k / rate, *felt, force])
         push = (-0.7 if turned else 0.7) * force - 0.4 * np.tanh(20 * z[1]) if k >= begin else 0.0
         z = model.system.step(z[None], np.array([[push]]), model.values, 1 / rate)[0]
+    return written(path, rows)
+
+
+def written(path, rows):
+    """Write rows of t, x, v, force as a table."""
     np.savetxt(path, rows, "%.5f", ",", header="t,x,v,force", comments="")
     return path
+
+
+def rows_of(path):
+    """Read the rows of a table."""
+    return np.loadtxt(path, delimiter=",", skiprows=1)
+
+
+def stored_from(w, path, before):
+    """Return the last trial, the rows of its log and the row of each step, its commands checked."""
+    stored, table = w.trials()[-1].trial, rows_of(path)
+    k = round(before * RATE) + 5 * np.arange(stored.steps)
+    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    return stored, table, k
 
 
 def follow(policy, step, state, past):

@@ -10,7 +10,7 @@ import pytest
 
 from facts import of_code
 from grounded.errors import GroundedError
-from recorded import LOGGED, RATE, record, waiting
+from recorded import LOGGED, record, rows_of, stored_from, waiting
 
 ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
     "[estimate]\nmeasured = { x = 0.002 }\n"
@@ -23,14 +23,13 @@ def blind(tmp_path):
     return waiting(tmp_path, ONLY_POSITIONS)
 
 
-def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, before=0.8):
+@pytest.mark.parametrize("differs", [0, 16], ids=["known", "a program's speeds lag"])
+def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, differs):
     policy = blind.candidate("c0002")[0].policy
-    path = record(blind, tmp_path / "a.csv", policy, before)
+    path = record(blind, tmp_path / "a.csv", policy, 0.8, differs=differs)
     found = blind.ingest(path)
     assert found.candidate == "c0002"
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    k = round(before * RATE) + 5 * np.arange(policy.horizon)
-    np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
+    assert stored_from(blind, path, 0.8)[0].steps == policy.horizon
     assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
 
 
@@ -39,23 +38,13 @@ def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, t
     for seed in range(3):
         path = record(blind, tmp_path / f"{seed}.csv", policy, 0.8, seed=seed)
         blind.ingest(path, candidate="c0002")
-        table = np.loadtxt(path, delimiter=",", skiprows=1)
+        table = rows_of(path)
         truth = table[80 + 5 * np.arange(policy.horizon + 1), 2]  # measured, to 0.01 m/s
         found = blind.trials()[-1].trial.states[:, 1]
         assert found[0] == 0.0  # it stood still until its first command
         off.append(found - truth)
     assert np.abs(np.mean(off, axis=0)[[0, -1]]).max() < 0.03
     assert np.sqrt(np.mean(np.square(off))) < 0.03
-
-
-def test_a_run_is_known_though_its_program_s_speeds_lag(blind, tmp_path, seed=0):
-    policy = blind.candidate("c0002")[0].policy
-    path = record(blind, tmp_path / "a.csv", policy, 0.8, seed=seed, differs=16)
-    found = blind.ingest(path)
-    assert found.candidate == "c0002"
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    k = round(0.8 * RATE) + 5 * np.arange(policy.horizon)
-    np.testing.assert_allclose(blind.trials()[-1].trial.inputs[:, 0], table[k, 3], atol=1e-4)
 
 
 ITS_OWN = LOGGED + "[estimate]\nmeasured = { x = 0.002 }\n"
@@ -68,9 +57,7 @@ def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, bef
     path = record(w, tmp_path / "a.csv", policy, before, noise=ROUGH)
     found = w.ingest(path)
     assert found.candidate == "c0002"
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    k, stored = round(before * RATE) + 5 * np.arange(policy.horizon), w.trials()[-1].trial
-    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    stored, table, k = stored_from(w, path, before)
     assert np.std(stored.states[:-1, 1] - table[k, 2]) > 0.3  # estimated all the same
     assert [one.about for one in of_code(found, "log.unread")] == [("v",)]
 

@@ -10,7 +10,7 @@ import pytest
 from facts import of_code
 from grounded_trials import Workspace
 from grounded_trials.workspace.intake.opening import run_start
-from recorded import RATE, record, waiting
+from recorded import RATE, record, rows_of, waiting, written
 
 
 @pytest.fixture
@@ -21,22 +21,20 @@ def w(tmp_path):
 def run(w, path, policy, strange, before=1.0):
     """The log of a run, its first commands `strange`, not the policy's; each with its own stamp."""
     record(w, path, policy, before)
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table = rows_of(path)
     every, first = round(policy.dt * RATE), round(before * RATE)
     for k, force in enumerate(strange):
         table[first + k * every : first + (k + 1) * every, 3] = force
     table[(np.arange(len(table)) - first) % every != 0, 3] = np.nan
-    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
-    return path
+    return written(path, table)
 
 
 def unsent(w, path, policy, missed):
     """The log of a run of which the first steps were never sent, nor anything before."""
     run(w, path, policy, ())
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
+    table = rows_of(path)
     table[: round((1.0 + missed * policy.dt) * RATE), 3] = np.nan
-    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
-    return path
+    return written(path, table)
 
 
 @pytest.mark.parametrize("missed", [0, 2])
@@ -65,11 +63,10 @@ def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discard
     assert found.candidate == "c0002" and found.trial != late.trial and not found.known
 
 
-def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path, said=True):
+def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path):
     log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, (-5.0, -4.9))
-    if said:
-        toml = w.folder / "grounded.toml"
-        toml.write_text(toml.read_text() + "[log.span]\nstart = 1.0\n")
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + "[log.span]\nstart = 1.0\n")
     w = Workspace(w.folder)
     found = w.ingest(log)
     assert found.candidate == "c0002" and not of_code(found, "log.not_run")

@@ -18,7 +18,7 @@ from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening import foreign
 from grounded_trials.workspace.intake.opening.run_start import recording
-from recorded import LOGGED, RATE, record, waiting
+from recorded import LOGGED, RATE, record, rows_of, stored_from, waiting, written
 from workspaces import make
 
 
@@ -37,10 +37,8 @@ def test_a_run_with_feedback_is_found_to_the_log_s_sample(w, tmp_path, before, f
         candidate="c0002" if forced else None,
     )
     assert found.candidate == "c0002" and not found.warnings[:-1]
-    stored = w.trials()[-1].trial
-    table = np.loadtxt(tmp_path / "b.csv", delimiter=",", skiprows=1)
-    k = round(before * RATE) + 5 * np.arange(policy.horizon)
-    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    stored, table, k = stored_from(w, tmp_path / "b.csv", before)
+    assert stored.steps == policy.horizon
     np.testing.assert_allclose(stored.states[:-1], table[k, 1:3], atol=1e-3)
 
 
@@ -54,9 +52,7 @@ def test_a_run_on_late_states_is_found_though_the_log_is_corrected_for_them(tmp_
     log = record(w, tmp_path / "b.csv", policy, before, late=12)
     found = w.ingest(log)
     assert found.candidate == "c0002"
-    stored, table = w.trials()[-1].trial, np.loadtxt(log, delimiter=",", skiprows=1)
-    k = round(before * RATE) + 5 * np.arange(policy.horizon)
-    np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
+    stored, table, k = stored_from(w, log, before)
     assert not of_code(found, "log.start_loose")
     np.testing.assert_allclose(stored.states[:-1, 0], table[k + 12, 1], atol=1e-3)
     np.testing.assert_allclose(stored.states[:-1, 1], table[k, 2], atol=1e-3)
@@ -99,13 +95,12 @@ def start_in(policy, felt, sent):
 def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, named):
     w = waiting(tmp_path, LOGGED + "[safety]\nx = [-5.0, 5.0]\n")
     policy = w.candidate("c0002")[0].policy
-
-    def cut(table):
-        at = 100 + round(100 * (fell or 1.0))
-        table[at:, 1] += 20.0 * bool(fell)
-        table[at:, 3] = 0.0 if fell else -2.0
-
-    log = edited(record(w, tmp_path / "a.csv", policy, 1.0), cut)
+    log = record(w, tmp_path / "a.csv", policy, 1.0)
+    table = rows_of(log)
+    at = 100 + round(100 * (fell or 1.0))
+    table[at:, 1] += 20.0 * bool(fell)
+    table[at:, 3] = 0.0 if fell else -2.0
+    written(log, table)
     wanted = "c0002" if named else None
     if not fell and not named:
         with pytest.raises(GroundedError, match="did not run"):
@@ -124,54 +119,42 @@ def test_a_run_that_fell_in_a_log_that_goes_on_has_failed_there(tmp_path, fell, 
 
 def test_commands_that_are_logged_steps_late_are_told(w, tmp_path, before=1.0, late=2):
     policy = w.candidate("c0002")[0].policy
-    table = np.loadtxt(record(w, tmp_path / "a.csv", policy, before), delimiter=",", skiprows=1)
+    table = rows_of(record(w, tmp_path / "a.csv", policy, before))
     rows = late * round(policy.dt * RATE)
     table[rows:, 3] = table[: len(table) - rows, 3]
-    np.savetxt(tmp_path / "b.csv", table, "%.5f", ",", header="t,x,v,force", comments="")
-    told = of_code(w.ingest(tmp_path / "b.csv"), "log.late")
-    assert [one.facts["steps"] for one in told] == [late] * bool(late)
+    (told,) = of_code(w.ingest(written(tmp_path / "b.csv", table)), "log.late")
+    assert told.facts["steps"] == late
 
 
 def test_a_run_on_samples_of_a_step_before_is_told(w, tmp_path, before=0.93, stale=1):
     policy = w.candidate("c0002")[0].policy
     found = w.ingest(record(w, tmp_path / "a.csv", policy, before, stale=stale))
-    told = of_code(found, "log.late")
-    assert [one.facts["steps"] for one in told] == [stale] * bool(stale)
-    assert found.candidate == "c0002"
+    (told,) = of_code(found, "log.late")
+    assert told.facts["steps"] == stale and found.candidate == "c0002"
 
 
-def test_a_program_whose_clock_ran_before_is_told_without_the_candidate_s_name(
-    w, tmp_path, before=0.5
+@pytest.mark.parametrize(("code", "before"), [("run.clock", 0.5), ("run.clipped", 1.0)])
+def test_a_clock_that_ran_before_and_commands_that_were_cut_are_told_without_a_name(
+    w, tmp_path, code, before
 ):
     policy = w.candidate("c0002")[0].policy
-    log = record(w, tmp_path / "a.csv", policy, before, ahead=10)
+    most = 0.6 * float(np.abs(policy.feedforward).max())  # no commands in another unit
+    differs = {"ahead": 10} if code == "run.clock" else {"most": most}
+    log = record(w, tmp_path / "a.csv", policy, before, **differs)
     with pytest.raises(GroundedError) as refused:
         w.ingest(log)
     told = refused.value.finding
-    assert (told.code, told.facts["step"]) == ("run.clock", 10)
+    assert told.code == code and (code != "run.clock" or told.facts["step"] == 10)
     assert refused.value.then == NextCommand("next", ("LOG",))
     named = w.ingest(log, candidate="c0002")
-    assert named.then.verb == "discard" and named.findings[0].code == told.code
-
-
-def test_commands_that_were_cut_are_no_commands_in_another_unit(w, tmp_path, before=1.0, part=0.6):
-    policy = w.candidate("c0002")[0].policy
-    most = part * float(np.abs(policy.feedforward).max())
-    log = record(w, tmp_path / "a.csv", policy, before, most=most)
-    with pytest.raises(GroundedError) as refused:
-        w.ingest(log)
-    assert refused.value.finding.code == "run.clipped"
-    assert refused.value.then == NextCommand("next", ("LOG",))
-    named = w.ingest(log, candidate="c0002")
-    assert named.then.verb == "discard" and of_code(named, "run.clipped")
+    assert named.then.verb == "discard" and of_code(named, code)
 
 
 def test_a_log_with_two_runs_says_which_is_taken(w, tmp_path):
     path = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1.0)
-    once = np.loadtxt(path, delimiter=",", skiprows=1)
+    once = rows_of(path)
     length = once[-1, 0] - once[0, 0] + 1 / RATE
-    twice = np.vstack([once, once + np.array([length, 0, 0, 0])])
-    np.savetxt(path, twice, "%.5f", ",", header="t,x,v,force", comments="")
+    written(path, np.vstack([once, once + np.array([length, 0, 0, 0])]))
     (told,) = of_code(w.ingest(path), "log.start_doubt")
     times = sorted(told.facts[k] for k in ("used", "rival"))
     assert times == [pytest.approx(1.0, abs=1e-3), pytest.approx(1 + length, abs=1e-3)]
@@ -279,32 +262,21 @@ def test_a_log_while_nothing_waits_is_offered_as_what_its_commands_are(tmp_path)
     policy = w.propose().candidate.policy
     w.ingest(record(w, tmp_path / "first.csv", policy, 0.0))
     again = record(w, tmp_path / "again.csv", policy, 0.0, seed=1)
-    table = np.loadtxt(again, delimiter=",", skiprows=1)
+    table = rows_of(again)
     table[:, 3] = 2 * np.sin(np.arange(len(table)) // 10)
-    hand = tmp_path / "hand.csv"
-    np.savetxt(hand, table, "%.5f", ",", header="t,x,v,force", comments="")
+    hand = written(tmp_path / "hand.csv", table)
     for log, then in ((again, ("--candidate", "c0001")), (hand, ("--data",))):
         with pytest.raises(GroundedError) as refused:
             w.ingest(log)
         assert refused.value.then == NextCommand("ingest", (str(log), *then))
 
 
-def edited(path, change):
-    """The log with its rows changed: t, x, v, force."""
-    table = np.loadtxt(path, delimiter=",", skiprows=1)
-    change(table)
-    np.savetxt(path, table, "%.5f", ",", header="t,x,v,force", comments="")
-    return path
-
-
 def test_a_gap_within_the_run_is_the_reason_that_is_given(w, tmp_path):
-
-    def hole(table):
-        table[450:470, 1:3] = np.nan
-
-    log = edited(record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 4.0), hole)
+    log = record(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 4.0)
+    table = rows_of(log)
+    table[450:470, 1:3] = np.nan
     with pytest.raises(GroundedError, match="max_age_s"):
-        w.ingest(log)
+        w.ingest(written(log, table))
 
 
 def test_a_delay_that_puts_states_off_is_named_where_a_run_seems_to_begin_too_early(tmp_path):
