@@ -159,12 +159,8 @@ def check_store(store: Store, acknowledged: set[int]) -> list[str]:
     kept = [int(store.read(entry).split(b" ", 1)[0]) for entry in store.list()]
     failures += [f"acknowledged file {i} is gone" for i in acknowledged - set(kept)]
     failures += ["a file is kept twice"] * (len(kept) != len(set(kept)))
-    failures += [f"file {i} has other bytes" for i in acknowledged if content(i) not in _all(store)]
-    return failures
-
-
-def _all(store: Store) -> set[bytes]:
-    return {store.read(entry) for entry in store.list()}
+    whole = {store.read(entry) for entry in store.list()}
+    return failures + [f"file {i} has other bytes" for i in acknowledged if content(i) not in whole]
 
 
 def kills(count: int, seed: int = 0) -> Outcome:
@@ -217,21 +213,24 @@ def concurrent(processes: int = 24, contents: int = 12) -> Outcome:
     return Outcome(processes, tuple(failures), f"{contents} files, each kept once")
 
 
-ADD = """
+START, STOP = "/grounded-marker-start", "/grounded-marker-stop"  # between them, the store's calls
+ADD = f"""
 import os, sys
-import filelock  # before the user changes, who may read no library
+import filelock  # before the user changes, who may read no library; its calls are not the store's
 from grounded.errors import GroundedError
 from grounded.findings.catalogue import codes
 from grounded_trials.store.store import Store
 codes()  # the words of an error
 if len(sys.argv) > 3:
     os.setuid(int(sys.argv[3]))
+os.path.exists({START!r})
 try:
-    added = Store(sys.argv[1]).add(bytes(int(sys.argv[2])))
+    Store(sys.argv[1]).add(b"1 " + bytes(int(sys.argv[2])))
 except GroundedError as error:
     print(error)
     sys.exit(1)
-print("added", added.sha256)
+os.path.exists({STOP!r})
+print("added")
 """
 
 
@@ -302,23 +301,6 @@ def read_only() -> Outcome:
 
 
 CALL = re.compile(r"^(?:\d+ +)?(\w+)\(")
-START, STOP = "/grounded-marker-start", "/grounded-marker-stop"
-TRACED = f"""
-import os, sys
-import filelock  # what Python reads of a library is not the store's
-from grounded.errors import GroundedError
-from grounded_trials.store.store import Store
-os.path.exists({START!r})
-try:
-    added = Store(sys.argv[1]).add(b"1 " + bytes(300_000))
-except GroundedError as error:
-    print(error)
-    sys.exit(1)
-os.path.exists({STOP!r})
-print("added")
-"""
-
-
 NEVER_FAIL = ("brk", "mmap", "munmap", "mremap", "mprotect", "getpid", "gettid", "geteuid")
 
 
@@ -328,7 +310,7 @@ def system_calls() -> list[tuple[str, int]]:
         log = Path(folder, "log")
         store = Path(folder, "store")
         Store(store).add(b"0 first")
-        command = ["strace", "-o", str(log), sys.executable, "-c", TRACED, str(store)]
+        command = ["strace", "-o", str(log), sys.executable, "-c", ADD, str(store), "300000"]
         subprocess.run(command, check=True, capture_output=True)
         counts: dict[str, int] = {}
         found, inside = [], False
@@ -358,9 +340,8 @@ def fault_injection(stride: int = 1) -> Outcome | None:
                 store.add(b"0 first")
                 command = ["strace", "-o", "/dev/null", "-e", f"trace={name}"]
                 command += ["-e", f"inject={name}:{fault}:when={number}"]
-                done = subprocess.run(
-                    [*command, sys.executable, "-c", TRACED, folder], capture_output=True, text=True
-                )
+                command += [sys.executable, "-c", ADD, folder, "300000"]
+                done = subprocess.run(command, capture_output=True, text=True)
                 where = f"{name} {number} {fault}"
                 if "Traceback" in done.stderr:
                     failures.append(f"{where}: {done.stderr[-400:]}")

@@ -1,30 +1,22 @@
 """Write ROS 2 bags of foreign robots (car, rover, arm, crane) with rosbags."""
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
-STORE.register(
-    get_types_from_msg(
-        "float32 steering_angle\nfloat32 steering_angle_velocity\nfloat32 speed\n"
-        "float32 acceleration\nfloat32 jerk",
-        "ackermann_msgs/msg/AckermannDrive",
-    )
-)
-STORE.register(
-    get_types_from_msg(
-        "std_msgs/Header header\nackermann_msgs/AckermannDrive drive",
-        "ackermann_msgs/msg/AckermannDriveStamped",
-    )
-)
-STORE.register(
-    get_types_from_msg(
-        "std_msgs/Header header\nuint8 type_mask\ngeometry_msgs/Quaternion orientation\n"
-        "geometry_msgs/Vector3 body_rate\nfloat32 thrust",
-        "mavros_msgs/msg/AttitudeTarget",
-    )
-)
+OTHERS = {
+    "ackermann_msgs/msg/AckermannDrive": "float32 steering_angle\n"
+    "float32 steering_angle_velocity\nfloat32 speed\nfloat32 acceleration\nfloat32 jerk",
+    "ackermann_msgs/msg/AckermannDriveStamped": "std_msgs/Header header\n"
+    "ackermann_msgs/AckermannDrive drive",
+    "mavros_msgs/msg/AttitudeTarget": "std_msgs/Header header\nuint8 type_mask\n"
+    "geometry_msgs/Quaternion orientation\ngeometry_msgs/Vector3 body_rate\nfloat32 thrust",
+    "crane_msgs/msg/SwingState": "std_msgs/Header header\nfloat64 angle\nfloat64 rate",
+    "crane_msgs/msg/MotorVoltage": "std_msgs/Header header\nfloat64 voltage",
+}
+for name, text in OTHERS.items():
+    STORE.register(get_types_from_msg(text, name))
 T = STORE.types
 DT, START = 0.01, 1_760_000_000_000_000_000
 
@@ -70,15 +62,15 @@ def joints(t, names, q, w, tau):
     )
 
 
-def bag(folder, topics, messages, storage=StoragePlugin.SQLITE3):
-    with Writer(folder, version=9, storage_plugin=storage) as writer:
+def bag(folder, topics, messages):
+    with Writer(folder, version=9) as writer:
         open_ = {t: writer.add_connection(t, kind, typestore=STORE) for t, kind in topics.items()}
         for topic, t, message in messages:
             writer.write(open_[topic], t, STORE.serialize_cdr(message, topics[topic]))
     return folder
 
 
-def car_bag(folder, storage=StoragePlugin.SQLITE3):
+def car_bag(folder):
     """Write a bag of a car with a wheelbase of 0.32 m, driven in curves for 8 s."""
     topics = {
         "/odom": "nav_msgs/msg/Odometry",
@@ -96,30 +88,23 @@ def car_bag(folder, storage=StoragePlugin.SQLITE3):
         messages.append(("/joint_states", t, joints(t, ["left", "right"], wheels, wheels, wheels)))
         v, psi = v + DT * (0.9 * speed - v) / 0.35, psi + DT * rate
         x, y = x + DT * v * np.cos(psi), y + DT * v * np.sin(psi)
-    return bag(folder, topics, messages, storage)
+    return bag(folder, topics, messages)
 
 
-def rover_bag(folder, *, seen=""):
+def rover_bag(folder):
     """Write a bag of a two-wheeled robot whose commands begin a little before its odometry."""
-    topics = {"/cmd_vel": "geometry_msgs/msg/Twist"}
-    if seen:
-        topics |= {seen: "geometry_msgs/msg/PoseStamped"}
-    else:
-        topics |= {
-            "/odom": "nav_msgs/msg/Odometry",
-            "/joint_states": "sensor_msgs/msg/JointState",
-        }
+    topics = {
+        "/cmd_vel": "geometry_msgs/msg/Twist",
+        "/odom": "nav_msgs/msg/Odometry",
+        "/joint_states": "sensor_msgs/msg/JointState",
+    }
     messages, v, w, x, y, psi = [], 0.0, 0.0, 0.0, 0.0, 0.0
     names = ["wheel_left_joint", "wheel_right_joint"]
     for k in range(1000):
         t, ahead, turn = START + k * 10**7, 0.6 * np.sin(0.01 * k) ** 2, 0.8 * np.sin(0.013 * k)
         if k % 5 == 0:
             messages.append(("/cmd_vel", t, twist(float(ahead), float(turn))))
-        if seen:
-            pose = odometry(t, x, y, psi, v, w).pose.pose
-            stamped = T["geometry_msgs/msg/PoseStamped"](header=header(t), pose=pose)
-            messages.append((seen, t, stamped))
-        elif k > 0:
+        if k > 0:
             messages.append(("/odom", t, odometry(t, x, y, psi, v, w)))
             sides = np.array([v - 0.26 * w, v + 0.26 * w]) / 0.1
             turned = np.array([x, x]) / 0.1
@@ -130,7 +115,7 @@ def rover_bag(folder, *, seen=""):
     return bag(folder, topics, messages)
 
 
-def boat_bag(folder, left, right):
+def boat_bag(folder, left="/thruster_left", right="/thruster_right"):
     """Write a bag of a boat with two thrusters, whose commands are numbers on two topics."""
     topics = {"/odom": "nav_msgs/msg/Odometry"}
     topics |= dict.fromkeys((left, right), "std_msgs/msg/Float32")
@@ -215,11 +200,9 @@ def arm_bag(folder, scale=1.0):
     return bag(folder, topics, messages)
 
 
-def commanded_arm_bag(
-    folder, order=("shoulder", "elbow"), goals=True, seed=0, measured_torques=False
-):
+def commanded_arm_bag(folder, order=("shoulder", "elbow"), measured_torques=False):
     """Write a bag of a vertical arm: JointState in alphabetical order, commands without names."""
-    rng, own, h = np.random.default_rng(seed), ("shoulder", "elbow"), 0.002
+    rng, own, h = np.random.default_rng(0), ("shoulder", "elbow"), 0.002
     topics = {
         "/joint_states": "sensor_msgs/msg/JointState",
         "/effort_controller/commands": "std_msgs/msg/Float64MultiArray",
@@ -230,7 +213,7 @@ def commanded_arm_bag(
     for k in range(10_000):
         t = START + k * 2 * 10**6
         measured = q + 5e-4 * rng.normal(size=2), w + 0.01 * rng.normal(size=2)
-        if k % 500 == 0 and goals:
+        if k % 500 == 0:
             goal = rng.uniform(-0.9, 1.1, 2)
         if k % 5 == 0:
             names = ["elbow_joint", "shoulder_joint"]
@@ -257,16 +240,6 @@ def _arm_acceleration(q, w, u):
     push = turning * (2 * w[0] * w[1] + w[1] ** 2) - fall - 7.26 * np.sin(q[0]) - 0.35 * w[0]
     pull = -turning * w[0] ** 2 - fall - 0.12 * w[1]
     return np.linalg.solve(mass, u + np.array([push, pull]))
-
-
-STORE.register(
-    get_types_from_msg(
-        "std_msgs/Header header\nfloat64 angle\nfloat64 rate", "crane_msgs/msg/SwingState"
-    )
-)
-STORE.register(
-    get_types_from_msg("std_msgs/Header header\nfloat64 voltage", "crane_msgs/msg/MotorVoltage")
-)
 
 
 def crane_bag(folder, joint="trolley"):
@@ -298,8 +271,8 @@ def crane_bag(folder, joint="trolley"):
     return bag(folder, topics, messages)
 
 
-def thruster_bag(folder, swapped=False):
-    """Write a bag of a boat whose two thrusters lag by 0.2 s, commanded in one array."""
+def thruster_bag(folder):
+    """Write a bag of a boat whose two thrusters lag by 0.2 s, the right one first in an array."""
     rng, h = np.random.default_rng(3), 0.02
     array = T["std_msgs/msg/Float64MultiArray"]
     layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
@@ -314,8 +287,8 @@ def thruster_bag(folder, swapped=False):
         if k % 60 == 0:
             sent = rng.uniform(-0.6, 1.0, 2)
         if k % 5 == 0:
-            told = sent[::-1] if swapped else sent
-            messages.append(("/thrusters/cmd", t, array(layout=layout, data=np.array(told))))
+            told = array(layout=layout, data=sent[::-1].copy())
+            messages.append(("/thrusters/cmd", t, told))
         seen = np.array([x, y, psi, u, r]) + rng.normal(0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3])
         pose = odometry(t, *seen)
         pose.twist.twist.linear.y = v + 0.015 * rng.normal()

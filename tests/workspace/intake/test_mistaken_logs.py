@@ -77,8 +77,34 @@ def log(w, path, scale=1.0, columns=("port", "starboard"), seed=0):
     for k, u in enumerate(sent):
         rows.append([0.05 * k, *(x + rng.normal(0, 2e-3, 3)), *(scale * u)])
         x = model.system.step(x[None], u[None] * [0.9, 1.1], model.values, 0.05)[0]
-    np.savetxt(path, rows, "%.6f", ",", header=f"t,v,r,psi,{','.join(columns)}", comments="")
+    return written(path, rows, *columns)
+
+
+def written(path, rows, *columns):
+    """Write rows of t, v, r, psi and two commands as a table, the commands called as they say."""
+    head = ",".join(("t", "v", "r", "psi", *(columns or ("port", "starboard"))))
+    np.savetxt(path, rows, "%.9f", ",", header=head, comments="")
     return path
+
+
+def run_crossed(w):
+    """Plan a candidate and run it on a robot whose commands arrive at each other's motor."""
+    plan, model = w.propose().candidate, w.base_model
+    crossed = replace(
+        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
+    )
+    ran = Plant(crossed).run(plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG)
+    return plan, ran, [0.05 * np.arange(ran.steps), ran.states[:-1]]
+
+
+def in_percent(w):
+    """The workspace with a scale of 0.01 at both commands."""
+    toml = w.folder / "grounded.toml"
+    text = toml.read_text()
+    for name in ("port", "starboard"):
+        text = text.replace(f'"/csv.{name}" }}', f'"/csv.{name}", scale = 0.01 }}')
+    toml.write_text(text)
+    return Workspace(w.folder)
 
 
 def test_exchanged_commands_are_told_at_once_and_stop_a_diagnosis(w, tmp_path):
@@ -103,25 +129,16 @@ def test_an_exchange_that_earlier_logs_do_not_show_is_the_robot_s(w, tmp_path):
     assert w.discard("t0002").then.verb != "ingest"
 
 
-def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_table(
-    w, tmp_path, before=True
-):
+def test_a_run_with_its_motors_exchanged_is_to_be_run_again_with_the_same_log_table(w, tmp_path):
     toml = w.folder / "grounded.toml"
     text = toml.read_text().replace("/csv.port", "/csv.m1").replace("/csv.starboard", "/csv.m2")
     toml.write_text(text)
-    if before:
-        w.ingest(log(w, tmp_path / "a.csv", columns=("m1", "m2")), data=True)
-    plan, path = w.propose().candidate, tmp_path / "run.csv"
-    model = w.base_model
-    crossed = replace(
-        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
-    )
-    ran = Plant(crossed).run(plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG)
-    table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs])
-    np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,m1,m2", comments="")
+    w.ingest(log(w, tmp_path / "a.csv", columns=("m1", "m2")), data=True)
+    plan, ran, seen = run_crossed(w)
+    path = written(tmp_path / "run.csv", np.column_stack([*seen, ran.inputs]), "m1", "m2")
     found = w.ingest(path)
     (told,) = of_code(found, "run.exchanged")
-    assert found.then.verb == "discard" and ("proven" in told.facts) == before
+    assert found.then.verb == "discard" and "proven" in told.facts
     assert w.discard(found.trial).then == NextCommand("run")  # by its [system]
     known = w.ingest(path)
     assert known.then == w.status().then and any(f"run {plan.id}" in s for s in known.warnings)
@@ -144,22 +161,17 @@ def test_limits_in_the_wrong_unit_of_a_log_are_told_with_the_right_ones(tmp_path
 
 
 def test_a_log_in_a_wrong_unit_is_to_be_ingested_again_once_it_is_discarded(
-    w, tmp_path, monkeypatch, here=True
+    w, tmp_path, monkeypatch
 ):
     path = log(w, tmp_path / "a.csv", scale=100.0)
     w.ingest(path, data=True)
     (tmp_path / "b").mkdir()
     monkeypatch.chdir(tmp_path / "b")
-    if not here:
-        path = path.rename(tmp_path / "b" / "elsewhere.csv")
     done = w.discard("t0001")
-    assert done.then == NextCommand("ingest", ("../a.csv" if here else "LOG", "--data"))
+    assert done.then == NextCommand("ingest", ("../a.csv", "--data"))
     said = grounded("-C", w.folder, "discard", "t0001").out.replace("\\\n", "").split()
     assert said[-3:] == ["ingest", *done.then.arguments]
-    toml = w.folder / "grounded.toml"
-    toml.write_text(toml.read_text().replace('port" }', 'port", scale = 0.01 }'))
-    toml.write_text(toml.read_text().replace('starboard" }', 'starboard", scale = 0.01 }'))
-    again = Workspace(w.folder).ingest(path, data=True)
+    again = in_percent(w).ingest(path, data=True)
     assert (again.trial, again.warnings) == ("t0002", ())
     assert Workspace(w.folder).discard("t0002").then == NextCommand("status")
 
@@ -172,12 +184,7 @@ def test_percent_is_told_with_the_scale_and_a_scale_mends_it(w, tmp_path):
         w.diagnose()
     assert stopped.value.then is not None and stopped.value.then.verb == "discard"
     w.discard("t0001")
-    toml = w.folder / "grounded.toml"
-    text = toml.read_text()
-    for name in ("port", "starboard"):
-        text = text.replace(f'"/csv.{name}" }}', f'"/csv.{name}", scale = 0.01 }}')
-    toml.write_text(text)
-    again = Workspace(w.folder)
+    again = in_percent(w)
     assert not again.ingest(path, data=True).warnings and again.preflight() == ()
 
 
@@ -187,8 +194,7 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     trial = read_trial(next((w.folder / "runs").iterdir()))[0]
     t = trial.dt * np.arange(trial.steps)
     table = np.column_stack([t, trial.states[:-1], trial.inputs])
-    path = tmp_path / "run.csv"
-    np.savetxt(path, table, "%.9f", ",", header="t,v,r,psi,starboard,port", comments="")
+    path = written(tmp_path / "run.csv", table, "starboard", "port")
     with pytest.raises(GroundedError) as refused:
         w.ingest(path)
     said = str(refused.value)
@@ -206,39 +212,25 @@ def test_a_run_with_exchanged_commands_names_them(w, tmp_path):
     assert Workspace(w.folder).ingest(path).candidate == plan.id
 
 
-def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path, before=True):
-    if before:
-        w.ingest(log(w, tmp_path / "a.csv"), data=True)
-    plan, model, path = w.propose().candidate, w.base_model, tmp_path / "run.csv"
-    wired = replace(
-        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
-    )
-    ran = Plant(wired).run(plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG)
-    table = np.column_stack([0.05 * np.arange(ran.steps), ran.states[:-1], ran.inputs[:, ::-1]])
-    np.savetxt(path, table, "%.7f", ",", header="t,v,r,psi,port,starboard", comments="")
+def test_outputs_that_a_program_exchanged_are_mended_there(w, tmp_path):
+    w.ingest(log(w, tmp_path / "a.csv"), data=True)
+    _, ran, seen = run_crossed(w)
     with pytest.raises(GroundedError) as refused:
-        w.ingest(path)
+        w.ingest(written(tmp_path / "run.csv", np.column_stack([*seen, ran.inputs[:, ::-1]])))
     told = refused.value.finding
-    assert (told.code, bool(told.facts["proven"])) == ("run.exchanged", before)
+    assert told.code == "run.exchanged" and told.facts["proven"]
     assert refused.value.then == NextCommand("next", ("LOG",))
 
 
-def driven_by(w, path, action, noise=1e-3, late=0, pull=1.0, shown=0):
-    """Write the log of a run whose program sends action(k, the states as they are logged, now).
-
-    pull: of the real robot's drives, relative to the model's. shown: steps by which commands are
-    logged late.
-    """
-    model, x, rows, past, sent = w.base_model, w.task.start.copy(), [], [], []
+def driven_by(w, path, action):
+    """Write the log of a run whose program sends action(k, the states as they are logged)."""
+    model, x, rows = w.base_model, w.task.start.copy(), []
     for k in range(w.task.horizon):
-        past.append(x + RNG.normal(0, noise, 3))
-        logged = past[max(0, k - late)]
-        u = action(k, logged, past[k])
-        sent.append(u)
-        rows.append([k * w.task.dt, *logged, *(sent[k - shown] if k >= shown else 0 * u)])
-        x = model.system.step(x[None], pull * u[None], model.values, w.task.dt)[0]
-    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
-    return w.ingest(path)
+        logged = x + RNG.normal(0, 1e-3, 3)
+        u = action(k, logged)
+        rows.append([k * w.task.dt, *logged, *u])
+        x = model.system.step(x[None], u[None], model.values, w.task.dt)[0]
+    return w.ingest(written(path, rows))
 
 
 @pytest.mark.parametrize("waits", [0, 8])
@@ -246,7 +238,7 @@ def test_a_program_whose_clock_began_with_the_log_is_told(w, tmp_path, waits):
     plan, dt = w.propose().candidate, w.task.dt
     runner = Runner(plan.policy)
 
-    def action(k, logged, now):
+    def action(k, logged):
         return runner.action(k * dt, logged) if k >= waits else np.zeros(2)
 
     found = driven_by(w, tmp_path / "run.csv", action)
@@ -261,18 +253,17 @@ def test_a_program_that_sends_an_input_with_the_other_sign_is_told(w, tmp_path, 
     runner, path = Runner(plan.policy), tmp_path / "run.csv"
     if fault == "program":
         with pytest.raises(GroundedError) as refused:
-            driven_by(w, path, lambda k, logged, now: wrong * runner.action(k * dt, logged))
+            driven_by(w, path, lambda k, logged: wrong * runner.action(k * dt, logged))
         told = refused.value.finding
         assert refused.value.then == NextCommand("next", ("LOG",))
         assert (told.code, told.about, told.facts["times"]) == ("run.sends", ("starboard",), -1)
         return
-    driven_by(w, path, lambda k, logged, now: runner.action(k * dt, logged))
+    driven_by(w, path, lambda k, logged: runner.action(k * dt, logged))
     w.discard("t0001")
     rows = np.loadtxt(path, delimiter=",", skiprows=1)
     rows[:, 5] *= -1
-    np.savetxt(path, rows, "%.9f", ",", header="t,v,r,psi,port,starboard", comments="")
     with pytest.raises(GroundedError) as refused:
-        w.ingest(path)
+        w.ingest(written(path, rows))
     assert holds(str(refused.value), "starboard", "sign in [log.input.starboard]")
 
 
@@ -282,7 +273,7 @@ def test_states_from_another_origin_are_told_with_their_offsets(w, tmp_path, nam
     plan, dt, off = w.propose().candidate, w.task.dt, np.array([0.3, 0.0, -0.45])
     runner, path = Runner(plan.policy), tmp_path / "run.csv"
     with pytest.raises(GroundedError) as refused:
-        driven_by(w, path, lambda k, logged, now: runner.action(k * dt, logged + off))
+        driven_by(w, path, lambda k, logged: runner.action(k * dt, logged + off))
     if not named:
         assert refused.value.finding.code == "run.origin"
         assert refused.value.finding.facts["off"] == ("v 0.30 m/s", "psi -0.45 rad")
