@@ -14,13 +14,13 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from facts import holding
 from grounded.errors import GroundedError, NextCommand
-from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_records import Schema
 from grounded_trials.formats.protobuf import file_descriptor_set, numbers_in
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.trial_file import TrialWriter, read_trial, trial_bytes, write_trial
 from rewriting import with_metadata
+from small_tasks import a_policy
 
 
 def a_trial(steps: int = 40, seed: int = 0) -> Trial:
@@ -33,23 +33,6 @@ def a_trial(steps: int = 40, seed: int = 0) -> Trial:
         input_names=("steering", "throttle"),
         candidate="c0003",
         start_inputs=np.array([0.1, -0.0]),
-    )
-
-
-def a_policy(H: int = 20, feedback: bool = True) -> Policy:
-    rng = np.random.default_rng(1)
-    return Policy(
-        feedforward=rng.normal(size=(H, 2)),
-        low=np.array([-1.0, -np.inf]),
-        high=np.array([0.1, np.inf]),
-        dt=1 / 30,
-        state_names=("v", "x", "psi"),
-        input_names=("steering", "throttle"),
-        depths=(2, 1),
-        angles=(False, False, True),
-        past=np.array([0.0, 1 / 3]),
-        gain=rng.normal(size=(H, 2, 6)) if feedback else None,
-        reference=rng.normal(size=(H, 6)) if feedback else None,
     )
 
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from rosbags.rosbag2 import StoragePlugin
 
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
@@ -27,8 +26,9 @@ COMMANDS = "/valve_controller/commands"
 NAMES = ["boom_joint", "stick_joint"]
 
 
-def excavator(folder, topic="/joint_states", commands=True, still=0, storage=StoragePlugin.SQLITE3):
-    """An arm of two joints for 6 s, at first `still` for some rows; its commands may be missing."""
+def excavator(folder, commands=True):
+    """An arm of two joints for 6 s; its commands may be missing."""
+    topic = "/joint_states"
     topics = {topic: "sensor_msgs/msg/JointState", COMMANDS: "std_msgs/msg/Float64MultiArray"}
     layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
 
@@ -36,14 +36,14 @@ def excavator(folder, topic="/joint_states", commands=True, still=0, storage=Sto
         q, w = np.array([0.3, -1.2]), np.zeros(2)
         for k in range(600):
             t = START + k * 10**7
-            u = 0.5 * np.sin(np.array([0.02, 0.031]) * max(k - still, 0))
+            u = 0.5 * np.sin(np.array([0.02, 0.031]) * k)
             yield topic, t, joints(t, NAMES, q, w, np.zeros(2))
             if commands and k % 2 == 0:
                 yield COMMANDS, t, T[topics[COMMANDS]](layout=layout, data=u)
             w = w + 0.07 * (0.6 * u - w)
             q = q + 0.01 * w
 
-    return bag(folder, topics, messages(), storage)
+    return bag(folder, topics, messages())
 
 
 @pytest.fixture

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 
+from bombs import log
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.formats.message_path import Field
@@ -141,18 +142,13 @@ def refused(path: Any, spec: SignalSpec, says: str) -> None:
 
 
 def one_message(path: Path, encoding: str, schema: tuple[str, str, bytes], body: bytes) -> Path:
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        number = writer.register_schema(*schema)
-        writer.add_message(writer.register_channel("/a", encoding, number), 2 * 10**9, body, 0)
-        writer.finish()
+    path.write_bytes(log(encoding, schema, [body]))
     return path
 
 
 def test_messages_that_do_not_fit_their_definition(tmp_path: Path) -> None:
     schema = ("x/msg/M", "ros2msg", b"float64 v\nstring s\nfloat64[] l")
-    spec = SignalSpec("/a.v", "log")
+    spec = SignalSpec("/t.v", "log")
     short = one_message(tmp_path / "1.mcap", "cdr", schema, b"\0\1\0\0abc")
     refused(short, spec, "x/msg/M")
     odd = one_message(tmp_path / "2.mcap", "cdr", schema, b"\0\3\0\0" + bytes(50))
@@ -162,12 +158,12 @@ def test_messages_that_do_not_fit_their_definition(tmp_path: Path) -> None:
     idl = one_message(tmp_path / "4.mcap", "cdr", ("x/msg/M", "what", b"x"), b"\0\1\0\0")
     refused(idl, spec, "'what'")
     bad = one_message(tmp_path / "5.mcap", "json", ("x", "jsonschema", b"{}"), b"{")
-    refused(bad, spec, "/a")
+    refused(bad, spec, "/t")
     body = b"\0\1\0\0" + struct.pack("<dI3xxIIdd", 1, 1, 2, 0, 2.0, 3.0)
     many = one_message(tmp_path / "6.mcap", "cdr", schema, body)
-    refused(many, SignalSpec("/a.l[:]", "log"), "expected one value")
-    assert read_signals(many, {"l": SignalSpec("/a.l[1]", "log")})["l"].values.tolist() == [3]
-    refused(many, SignalSpec("/a.l[2]", "log"), "none of 1 message")
+    refused(many, SignalSpec("/t.l[:]", "log"), "expected one value")
+    assert read_signals(many, {"l": SignalSpec("/t.l[1]", "log")})["l"].values.tolist() == [3]
+    refused(many, SignalSpec("/t.l[2]", "log"), "none of 1 message")
 
 
 @needs_data

@@ -40,6 +40,15 @@ def test_the_factor_between_two_units(said, wanted, factor):
     assert factor_between(said, wanted) == (factor and pytest.approx(factor))
 
 
+def signals_of(tmp_path, model: str) -> dict:
+    """The signals that `init` finds for a model in log.csv."""
+    (tmp_path / "m.py").write_text(model)
+    log, file = tmp_path / "log.csv", tmp_path / "m.py"
+    made = grounded("init", tmp_path / "w", "--from", log, "--model", file, "--yes", "--json")
+    assert made.code == 0, made.err
+    return {one["name"]: one for one in made.json["signals"]}
+
+
 def test_units_in_a_table_s_first_row_become_scales(tmp_path):
     t = np.arange(0, 4, 0.02)
     v = np.sin(t)
@@ -47,12 +56,8 @@ def test_units_in_a_table_s_first_row_become_scales(tmp_path):
     rows = np.column_stack([t, 1e3 * x, 1e3 * v, np.rad2deg(theta), np.cos(t) + v])
     head = "t,x [mm],v [mm/s],theta (deg),volt [V]"
     np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
-    (tmp_path / "m.py").write_text(MODEL)
     w = tmp_path / "w"
-    made = grounded(
-        "init", w, "--from", tmp_path / "log.csv", "--model", tmp_path / "m.py", "--yes"
-    )
-    assert made.code == 0, made.err
+    signals_of(tmp_path, MODEL)
     whole = (w / "grounded.toml").read_text()
     (w / "grounded.toml").write_text(whole.replace("scale = 0.001\n", "", 1))
     bare = grounded("-C", w, "ingest", "--data", tmp_path / "log.csv", "--json")
@@ -107,19 +112,7 @@ def begun(tmp_path, head: str, factors: dict[str, float]) -> dict:
     signals = {"r": r, "rd": rd, "th": th, "thd": thd, "volt": thd - 0.4 * np.sin(2 * t)}
     rows = np.column_stack([t, *(x / factors.get(name, 1) for name, x in signals.items())])
     np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
-    (tmp_path / "m.py").write_text(BEAM)
-    made = grounded(
-        "init",
-        tmp_path / "w",
-        "--from",
-        tmp_path / "log.csv",
-        "--model",
-        tmp_path / "m.py",
-        "--yes",
-        "--json",
-    )
-    assert made.code == 0, made.err
-    return {one["name"]: one for one in made.json["signals"]}
+    return signals_of(tmp_path, BEAM)
 
 
 @pytest.mark.parametrize(

@@ -17,13 +17,13 @@ from pathlib import Path
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.logs.recover import recover_log
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
 from grounded_trials.store.store import Store
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.within import within
+from small_tasks import a_policy
 
 MEMORY = "/dev/shm" if Path("/dev/shm").is_dir() else None  # where syncing is free
 
@@ -41,23 +41,9 @@ def a_trial(steps: int = 6, dt: float = 0.5) -> Trial:
     return Trial(x, u, dt, ("v", "x"), ("u",), candidate="c0001")
 
 
-def a_candidate() -> tuple[Policy, bytes]:
-    rng = np.random.default_rng(1)
-    policy = Policy(
-        feedforward=rng.normal(size=(4, 1)),
-        low=np.array([-1.0]),
-        high=np.array([np.inf]),
-        dt=0.5,
-        state_names=("v", "psi"),
-        input_names=("u",),
-        depths=(1,),
-        angles=(False, True),
-        past=np.zeros(1),
-        gain=rng.normal(size=(4, 1, 3)),
-        reference=rng.normal(size=(4, 3)),
-    )
-    data, _ = encoded_candidate(policy, np.zeros((5, 2)), np.zeros((4, 1)), {"alpha": "1.0"})
-    return policy, data
+def a_candidate() -> bytes:
+    policy = a_policy(2)
+    return encoded_candidate(policy, np.zeros((3, 3)), np.zeros((2, 2)), {"alpha": "1.0"})[0]
 
 
 def damaged(source: bytes, flips: bool, stride: int = 1) -> list[tuple[str, bytes]]:
@@ -76,7 +62,7 @@ def read_damaged(flips: bool, stride: int = 1) -> Outcome:
     """Check that a damaged trial or candidate is always refused with a message."""
     trial = trial_bytes(a_trial(), {"iteration": "1"}, b"a policy")
     tries, failures = 0, []
-    for source, read in ((trial, read_trial), (a_candidate()[1], read_candidate)):
+    for source, read in ((trial, read_trial), (a_candidate(), read_candidate)):
         for what, bad in damaged(source, flips, stride):
             tries += 1
             try:

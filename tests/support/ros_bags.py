@@ -115,10 +115,10 @@ def rover_bag(folder):
     return bag(folder, topics, messages)
 
 
-def boat_bag(folder, left="/thruster_left", right="/thruster_right"):
+def boat_bag(folder):
     """Write a bag of a boat with two thrusters, whose commands are numbers on two topics."""
     topics = {"/odom": "nav_msgs/msg/Odometry"}
-    topics |= dict.fromkeys((left, right), "std_msgs/msg/Float32")
+    topics |= dict.fromkeys(("/thruster_left", "/thruster_right"), "std_msgs/msg/Float32")
     messages, psi, x, y = [], 0.0, 0.0, 0.0
     number = T["std_msgs/msg/Float32"]
     for k in range(300):
@@ -127,7 +127,7 @@ def boat_bag(folder, left="/thruster_left", right="/thruster_right"):
         moving = odometry(t, x, y, psi, u, rate)
         moving.twist.twist.linear.y = v
         messages.append(("/odom", t, moving))
-        for topic, way in ((left, -1), (right, 1)):
+        for topic, way in (("/thruster_left", -1), ("/thruster_right", 1)):
             sent = 0.5 + 0.2 * np.sin(0.05 * k + 0.6) + way * 0.2 * np.sin(0.02 * k + 0.3)
             messages.append((topic, t, number(data=np.float32(sent))))
         psi += 0.05 * rate

@@ -9,6 +9,7 @@ import numpy as np
 
 from grounded.model import Model, Param
 from grounded.plant import Plant
+from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
@@ -63,17 +64,10 @@ def cart_task(**changes: Any) -> Task:
     """Return a task of two seconds: one metre forward, from rest to rest."""
     t = np.linspace(0.0, 1.0, 41)
     x = 10 * t**3 - 15 * t**4 + 6 * t**5
-    fields: dict[str, Any] = {
-        "model": cart,
-        "dt": 0.05,
-        "target": np.column_stack([x, np.full(41, np.nan)]),
-        "reward": Reward(np.array([10.0, 0.0]), np.zeros(2), np.array([0.01]), np.array([0.01])),
-        "start": np.zeros(2),
-        "past": np.zeros(1),
-        "low": np.array([-5.0]),
-        "high": np.array([5.0]),
-    }
-    return Task(**fields | changes)
+    target = np.column_stack([x, np.full(41, np.nan)])
+    fields: dict[str, Any] = {"model": cart, "dt": DT, "target": target}
+    fields |= {"state": [10.0, 0.0], "limit": 5.0, "effort": 0.01, "change": 0.01}
+    return plain_task(**fields | changes)
 
 
 def rover_task(**changes: Any) -> Task:
@@ -82,19 +76,13 @@ def rover_task(**changes: Any) -> Task:
     psi = 3.0 * t
     target = np.column_stack([np.sin(psi) / 3, (1 - np.cos(psi)) / 3, psi])
     fields: dict[str, Any] = {
-        "model": rover,
-        "dt": 0.05,
-        "target": target,
-        "reward": Reward(
-            np.array([10.0, 10.0, 1.0]), np.ones(3), np.full(2, 0.01), np.array([0.02, 0.03])
-        ),
-        "start": np.zeros(3),
         "past": np.array([0.5, 0.0]),
         "low": np.array([-2.0, -6.0]),
         "high": np.array([2.0, 6.0]),
         "latency": np.array([0.05, 0.02]),
     }
-    return Task(**fields | changes)
+    fields |= {"terminal": 1.0, "effort": 0.01, "change": np.array([0.02, 0.03])}
+    return plain_task(rover, DT, target, [10.0, 10.0, 1.0], np.inf, **fields | changes)
 
 
 def plain_task(
@@ -143,18 +131,9 @@ def speed_rover_task(model: Model) -> Task:
     v, w = np.minimum(0.5 * t, 1.0), 0.4 * np.sin(0.8 * t)
     psi = np.cumsum(w) * DT
     x, y = np.cumsum(v * np.cos(psi)) * DT, np.cumsum(v * np.sin(psi)) * DT
-    return Task(
-        model=model,
-        dt=DT,
-        target=np.column_stack([x, y, psi, v, w]),
-        reward=Reward(
-            np.array([1.0, 1.0, 1.0, 1.0, 0.0]), np.zeros(5), np.zeros(2), np.full(2, 0.01)
-        ),
-        start=np.zeros(5),
-        past=np.zeros(2),
-        low=np.array([-0.3, -1.8]),
-        high=np.array([1.5, 1.8]),
-    )
+    target, weights = np.column_stack([x, y, psi, v, w]), [1.0, 1.0, 1.0, 1.0, 0.0]
+    limits = {"low": np.array([-0.3, -1.8]), "high": np.array([1.5, 1.8])}
+    return plain_task(model, DT, target, weights, np.inf, change=0.01, **limits)
 
 
 def pushed_cart(
@@ -196,16 +175,7 @@ def pushed_cart(
 
 def pushed_cart_task(model: Model, steps: int = 120) -> Task:
     """Return a task of a pushed cart that only bounds its inputs."""
-    return Task(
-        model=model,
-        dt=DT,
-        target=np.zeros((steps + 1, 2)),
-        reward=Reward(np.ones(2), np.zeros(2), np.zeros(1), np.zeros(1)),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-1.0]),
-        high=np.array([1.0]),
-    )
+    return plain_task(model, DT, np.zeros((steps + 1, 2)), 1.0, 1.0)
 
 
 def scara(friction: float) -> Model:
@@ -242,20 +212,32 @@ def scara_task() -> Task:
     t = np.clip(np.linspace(0.0, 1.0, 101) / 0.8, 0.0, 1.0)
     way = 10 * t**3 - 15 * t**4 + 6 * t**5
     q = np.array([-0.4, 1.6]) + way[:, None] * np.array([1.1, -1.0])
-    return Task(
-        model=scara(0.0),
-        dt=0.01,
-        target=np.hstack([q, np.gradient(q, 0.01, axis=0)]),
-        reward=Reward(
-            np.array([0.826, 1.0, 0.0132, 0.016]),
-            np.array([100.0, 100.0, 10.0, 10.0]),
-            np.zeros(2),
-            np.array([1.6e-5, 1e-4]),
-        ),
-        start=np.array([-0.4, 1.6, 0.0, 0.0]),
-        past=np.zeros(2),
-        low=np.array([-25.0, -10.0]),
-        high=np.array([25.0, 10.0]),
+    fields: dict[str, Any] = {
+        "terminal": [100.0, 100.0, 10.0, 10.0],
+        "change": [1.6e-5, 1e-4],
+        "start": np.array([-0.4, 1.6, 0.0, 0.0]),
+        "low": np.array([-25.0, -10.0]),
+        "high": np.array([25.0, 10.0]),
+    }
+    target = np.hstack([q, np.gradient(q, 0.01, axis=0)])
+    return plain_task(scara(0.0), 0.01, target, [0.826, 1.0, 0.0132, 0.016], np.inf, **fields)
+
+
+def a_policy(H: int = 20, feedback: bool = True) -> Policy:
+    """Return a policy of random numbers, with one limited input and an angle among its states."""
+    rng = np.random.default_rng(1)
+    return Policy(
+        feedforward=rng.normal(size=(H, 2)),
+        low=np.array([-1.0, -np.inf]),
+        high=np.array([0.1, np.inf]),
+        dt=1 / 30,
+        state_names=("v", "x", "psi"),
+        input_names=("steering", "throttle"),
+        depths=(2, 1),
+        angles=(False, False, True),
+        past=np.array([0.0, 1 / 3]),
+        gain=rng.normal(size=(H, 2, 6)) if feedback else None,
+        reference=rng.normal(size=(H, 6)) if feedback else None,
     )
 
 

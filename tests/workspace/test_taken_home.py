@@ -70,14 +70,14 @@ WANTED = {
 }
 
 
-def adopted(folder: Path, files: dict[str, str], effect: str = "") -> Workspace:
+def adopted(folder: Path, files: dict[str, str], effect: str = "", found: str = FOUND) -> Workspace:
     """A workspace of an arm with parameters and effects in its grounded.toml."""
     folder.mkdir()
     for name, text in files.items():
         (folder / name).write_text(text, encoding="utf-8")
     w = Workspace.create(folder / "w", model=folder / "model.py")
     toml = w.folder / "grounded.toml"
-    found = FOUND.replace("EFFECT", effect)
+    found = found.replace("EFFECT", effect)
     toml.write_text(toml.read_text("utf-8").replace("[task]", found, 1), encoding="utf-8")
     return Workspace(w.folder)
 
@@ -194,19 +194,15 @@ URDF = """<robot name="arm">
 
 
 def test_a_urdf_has_masses_damping_and_friction_and_no_armature(tmp_path):
-    (tmp_path / "arm.urdf").write_text(URDF, encoding="utf-8")
     fields = 'params={"fore.mass": (0.1, 1.0), "elbow.damping": (0, 1), "elbow.armature": (0, 1)}'
     own = MODEL.replace("arm.xml", "arm.urdf")
     own = own[: own.index("params")] + fields + ")\n"
-    (tmp_path / "model.py").write_text(own, encoding="utf-8")
-    w = Workspace.create(tmp_path / "w", model=tmp_path / "model.py")
-    toml = w.folder / "grounded.toml"
     found = """params = { fore_mass = 0.6, elbow_damping = 0.05, elbow_armature = 0.01 }
 effects = [ { name = "coulomb_friction:elbow_vel", c = 2.0, width = 0.01 } ]
 
 [task]"""
-    toml.write_text(toml.read_text("utf-8").replace("[task]", found, 1), encoding="utf-8")
-    done = Workspace(w.folder).export_model(tmp_path / "found.urdf")
+    w = adopted(tmp_path / "a", {"arm.urdf": URDF, "model.py": own}, found=found)
+    done = w.export_model(tmp_path / "found.urdf")
     assert [(one.code, one.about) for one in done.findings] == [
         ("model.no_place", ("elbow.armature",))
     ]

@@ -15,23 +15,15 @@ from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
 from workspaces import MODEL, REAL, make
 
-TURNED = (
-    REAL.replace("import model as crude", "import model as plain")
-    + """
+TURNED = f"""{REAL}
 from dataclasses import replace
 from types import SimpleNamespace
 
-
-def turned(s, a, p):
-    return crude.derivative(s, SimpleNamespace(force=FORCE), p)
-
-
-model = replace(model, derivative=turned)
+real = model
+model = replace(
+    real, derivative=lambda s, a, p: real.derivative(s, SimpleNamespace(force=FORCE), p)
+)
 """
-)
-TURNED = TURNED.replace("latency =", "crude = model\nlatency =").replace(
-    "model = crude.with", "model = plain.with"
-)
 
 
 @pytest.fixture
@@ -48,10 +40,10 @@ def run(w, force):
     return w.run().trial_file
 
 
-def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path, steps=25):
+def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path):
     trial, *_ = read_trial(run(w, "-a.force"))
     assert w.task.utility(trial) < -100
-    write_trial(tmp_path / "t.mcap", trial.until(steps), {"kind": "trial", "task": w.task.hash})
+    write_trial(tmp_path / "t.mcap", trial.until(25), {"kind": "trial", "task": w.task.hash})
     done = w.next(tmp_path / "t.mcap")
     assert (done.proposed, done.exported, done.to_json()["propose"]) == (None, None, None)
     assert (done.taken.then.verb, done.taken.then.arguments) == ("discard", ("t0002",))

@@ -9,11 +9,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from grounded import Model, Reward, Task
+from grounded import Model
 from grounded.policy import Policy
 from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.workspace.intake.opening.run_start import recording
 from grounded_trials.workspace.intake.recognise import stories_of_log
+from small_tasks import plain_task
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
 HAND = np.array([38.0, 4.0])
@@ -83,17 +84,8 @@ def log_of(rows):
         params={},
         derivative=lambda s, a, p: {"tilt": s.rate, "rate": 45 * np.sin(s.tilt) - 9 * a.voltage},
     )
-    task = Task(
-        model=model,
-        dt=DT,
-        target=np.zeros((STEPS + 1, 2)),
-        reward=Reward(np.array([1.0, 0.1]), np.zeros(2), np.array([0.01]), np.zeros(1)),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-LIMIT]),
-        high=np.array([LIMIT]),
-        latency=np.array([0.025]),
-    )
+    late = {"effort": 0.01, "latency": np.array([0.025])}
+    task = plain_task(model, DT, np.zeros((STEPS + 1, 2)), [1.0, 0.1], LIMIT, **late)
     return task, recording(series, task, series)
 
 
