@@ -285,7 +285,8 @@ def _start_states(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> dic
     is not where it was on average.
     """
     still = bool(rates) and at_rest(leads, rates)
-    return {name: one.mean if still else one.line for name, one in leads.items() if one}
+    known = {name: one for name, one in leads.items() if one and (still or one.exact)}
+    return {name: one.mean if still else one.line for name, one in known.items()}
 
 
 def _extent(measured: Sequence[Samples], sent: Sequence[Samples], dt: float) -> tuple[int, int]:

@@ -41,6 +41,7 @@ class Lead:
     """What the samples before a time say of the value there."""
 
     line: float  # by a straight line through them
+    exact: bool  # the line is as good as the sample there, without the `QUANTUM`
     mean: float
     moves: bool  # the line is not level, by more than noise
     off: bool  # the mean is not 0, by more than noise
@@ -169,13 +170,16 @@ class Samples:
         if len(y) < FEWEST:
             return None
         tilt, level = np.polyfit(t, y, 1)
-        noise = float(np.sqrt((np.diff(y) ** 2).mean() / 2)) + QUANTUM * float(np.ptp(self.y))
+        own = float(np.sqrt((np.diff(y) ** 2).mean() / 2))
+        noise = own + QUANTUM * float(np.ptp(self.y))
         scatter = float(np.sqrt(((y - level - tilt * t) ** 2).sum() / (len(y) - 2)))
         there = self.y[min(int(np.searchsorted(self.t, at)), len(self.t) - 1)]
-        if scatter > STRAIGHT * noise or abs(there - level) > SURE * noise:
+        off_line = max(scatter / STRAIGHT, float(abs(there - level)) / SURE)
+        if off_line > noise:
             return None
         moves, mean = abs(tilt) * t.std() * len(y) ** 0.5 > SURE * noise, float(y.mean())
-        return Lead(float(level), mean, bool(moves), abs(mean) > SURE * noise / len(y) ** 0.5)
+        off = abs(mean) > SURE * noise / len(y) ** 0.5
+        return Lead(float(level), off_line <= own, mean, bool(moves), off)
 
     def held_from(self, at: int, value: float) -> Samples:
         """Return the samples with a value added at an earlier time [ns], if it is earlier."""
