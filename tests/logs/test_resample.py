@@ -74,6 +74,11 @@ def test_where_a_run_began_is_told_by_the_samples_before_it() -> None:
     assert np.nanstd(told) < 0.5 * np.std(rows) and abs(np.nanmean(told)) < 0.003
 
 
+def test_a_precise_curve_is_not_told_by_a_straight_line() -> None:
+    found = grid(pose(lambda t: 2 * t + 0.5 * t**2, rate=1000.0))
+    assert abs(found.start_states.get("x", found.states[0, 0])) < 1e-4
+
+
 def test_scale_offset_and_unwrapping() -> None:
     def wrapped_degrees(t: np.ndarray) -> np.ndarray:
         return np.rad2deg((2 * t + np.pi) % (2 * np.pi) - np.pi)
