@@ -177,10 +177,6 @@ def test_a_channel_that_is_defined_again_is_refused(tmp_path: Path) -> None:
     assert series["x"].values.tolist() == [1.0]
 
 
-STAMPED = "a/Header header\nfloat64 x\n" + "=" * 80
-STAMPED += "\nMSG: a/Header\nbuiltin_interfaces/Time stamp\nuint32 seq\n"
-
-
 @pytest.mark.parametrize("stamp", ['{"sec": 1e30, "nanosec": 0}', '{"sec": null, "nanosec": 0}'])
 def test_stamps_outside_the_calendar_are_refused(stamp: str, tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"

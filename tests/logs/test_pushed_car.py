@@ -29,10 +29,11 @@ def driven():
     return np.array(rows)
 
 
-def table(folder, *names):
+def table(folder, *names, rows=None):
     log = folder / "drive.csv"
     head = ",".join(("t", "v", "x", "y", "psi", *names))
-    np.savetxt(log, driven(), "%.5f", ",", header=head, comments="")
+    rows = driven() if rows is None else rows
+    np.savetxt(log, rows, "%.5f", ",", header=head, comments="")
     return log
 
 
@@ -53,18 +54,13 @@ def test_a_throttle_held_while_the_motor_is_off_is_no_start(tmp_path):
     """What [task] start holds is sent after a run, too."""
     rows = driven()
     rows[:50, 6] = 0.15
-    log = tmp_path / "drive.csv"
-    np.savetxt(log, rows, "%.5f", ",", header="t,v,x,y,psi,steering,throttle", comments="")
-    begin(tmp_path / "w", log, kind="car")
+    begin(tmp_path / "w", table(tmp_path, "steering", "throttle", rows=rows), kind="car")
     assert not Workspace(tmp_path / "w").task.past.any()
 
 
 @pytest.mark.parametrize(("head", "unit"), [("steering [%]", "1"), ("steering [deg]", "rad")])
 def test_a_steering_without_an_angle_is_a_part_of_the_lock(tmp_path, head, unit):
-    log = tmp_path / "drive.csv"
-    names = f"t,v,x,y,psi,{head},speed_cmd"
-    np.savetxt(log, driven(), "%.5f", ",", header=names, comments="")
-    begin(tmp_path / "w", log, kind="car")
+    begin(tmp_path / "w", table(tmp_path, head, "speed_cmd"), kind="car")
     model = Workspace(tmp_path / "w").task.model
     assert model.inputs["steering"] == unit and ("lock" in model.params) == (unit == "1")
 

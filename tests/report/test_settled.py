@@ -26,13 +26,6 @@ ROW = {
     "noise_floor": {"x": 0.01, "v": 0.019},
 }
 MADE = {"trials": ["t0001", "t0002"], "adopted": [], "params": {}, "nominal": {"mass": 1.0}}
-ADOPTED = {
-    "adopted": [{"name": FRICTION, "k": 0.3}],
-    "params": {"mass": 1.4},
-    "nominal": {"mass": 1.4, "viscous_friction_v_k": 0.3},
-}
-EMPTY = {"ranking": [], "parameters": {}, "credit": [], "leftover": [], "indistinguishable": []}
-NONE = {"kind": "none", "effects": [], "sentence": "Down to the noise."}
 
 
 def written(folder: Path, **more) -> Workspace:
@@ -43,11 +36,6 @@ def written(folder: Path, **more) -> Workspace:
 @pytest.fixture
 def folder(cart, tmp_path):
     return copied(cart, tmp_path / "w")
-
-
-def adopted_in(w: Workspace) -> dict:
-    """What the report's document says of what was adopted."""
-    return w.report().to_json()["adopted"]
 
 
 def test_what_was_adopted_is_told_everywhere(folder, cart):

@@ -67,16 +67,14 @@ def test_more_than_200_names_are_refused_before_anything_is_computed(n, m, tmp_p
     assert not (tmp_path / "w").exists()
 
 
-def test_a_fit_says_how_many_states_it_takes():
-    model = ring(51, 2)
-    with pytest.raises(GroundedError, match=holding("51 states", "50")):
-        fit(model, [logged(model)])
-
-
-def test_a_diagnosis_says_how_many_names_it_takes():
-    model = ring(20, 31)
-    with pytest.raises(GroundedError, match=holding("20 states", "31 inputs", "50")):
-        diagnose(model, [logged(model)])
+@pytest.mark.parametrize(
+    ("asked", "n", "m", "facts"),
+    [(fit, 51, 2, ("51 states", "50")), (diagnose, 20, 31, ("20 states", "31 inputs", "50"))],
+)
+def test_a_fit_and_a_diagnosis_say_how_many_names_they_take(asked, n, m, facts):
+    model = ring(n, m)
+    with pytest.raises(GroundedError, match=holding(*facts)):
+        asked(model, [logged(model)])
 
 
 @pytest.mark.slow

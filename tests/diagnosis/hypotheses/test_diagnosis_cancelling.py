@@ -74,26 +74,3 @@ def test_less_friction_than_modelled_is_said_so(turned, family):
     more, less = (meaning(effect, {name: Estimate(v, unit="1/s")}) for v in (3.9, -3.9))
     assert "3.9 1/s" in more and "less" not in more
     assert "3.9 1/s" in less and "less" in less and "-" not in less
-
-
-def axis():
-    """A mass that is pushed, and braked a little."""
-    return Model(
-        name="axis",
-        states={"x": "m", "v": "m/s"},
-        inputs={"F": "N"},
-        params={"m": Param(2.0, "kg", std=0.6), "b": Param(1.0, "N s/m", std=0.3)},
-        derivative=lambda s, a, p: {"x": s.v, "v": (a.F - p.b * s.v) / p.m},
-    )
-
-
-@pytest.fixture(scope="module")
-def pushed():
-    model, dt = axis(), 0.02
-    F = 8 * np.sin(0.3 * np.arange(200) + np.sin(0.05 * np.arange(200)))
-    states = [np.zeros(2)]
-    for value in F:
-        states.append(model.system.step(states[-1][None], np.array([[value]]), model.values, dt)[0])
-    trial = Trial(np.array(states), F[:, None], dt, model.state_names, model.input_names)
-    data = prepare(model, [trial])
-    return FittedHypotheses(data, Library().candidates(model, data.scales))

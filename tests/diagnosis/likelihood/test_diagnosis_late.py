@@ -183,11 +183,3 @@ def test_two_states_of_one_sensor_are_late_together_where_a_third_is_seen():
 def delayed(x, steps):
     at = np.maximum(np.arange(len(x)) - steps, 0.0)
     return np.interp(at, np.arange(len(x)), x)
-
-
-def filtered(x, steps):
-    """A first-order filter of what goes straight from sample to sample, in a hundred parts each."""
-    fine = np.interp(np.arange(100 * len(x)) / 100, np.arange(len(x)), x)
-    for k in range(1, len(fine)):
-        fine[k] = fine[k - 1] + (fine[k] - fine[k - 1]) * (1 - np.exp(-0.01 / steps))
-    return fine[::100]

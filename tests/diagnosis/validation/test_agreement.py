@@ -39,24 +39,17 @@ def test_a_value_that_differs_by_trial_is_told():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("first", "second", "effect", "values"),
-    [({"friction": 0.3}, {"friction": 0.5}, "coulomb_friction:v", (0.3, 0.5))],
-)
-def test_what_changed_between_two_groups(first, second, effect, values):
-    (model, before), (_, after) = (
-        pushed_cart(**first, trials=2, seed=1),
-        pushed_cart(**second, trials=2, seed=2),
-    )
+def test_what_changed_between_two_groups():
+    model, before = pushed_cart(friction=0.3, trials=2, seed=1)
+    _, after = pushed_cart(friction=0.5, trials=2, seed=2)
     found = diagnose(model, before, OPTIONS, compare=after)
     assert found.trials == 4 and found.changed is not None
-    assert [one.effect for one in found.changed] == ([effect] if effect else [])
-    assert ("gap.next.changed" in codes(found)) == bool(effect)
-    assert "gap.changed" in codes(found)
-    for one in found.changed:
-        assert (one.first.value, one.second.value) == pytest.approx(values, abs=0.06)
-        assert one.evidence > 20 and one.chance < 1e-6
-        assert abs(one.first.value - one.second.value) > 3 * np.hypot(one.first.std, one.second.std)
+    (one,) = found.changed
+    assert one.effect == "coulomb_friction:v"
+    assert {"gap.next.changed", "gap.changed"} <= {*codes(found)}
+    assert (one.first.value, one.second.value) == pytest.approx((0.3, 0.5), abs=0.06)
+    assert one.evidence > 20 and one.chance < 1e-6
+    assert abs(one.first.value - one.second.value) > 3 * np.hypot(one.first.std, one.second.std)
     again = Diagnosis.from_json(json.loads(json.dumps(found.to_json())))
     assert again == found and again.changed == found.changed
 
