@@ -80,14 +80,9 @@ def test_an_adopted_effect_is_the_one_that_was_diagnosed(effect):
         return  # the adopted one keeps a hidden true value; see their own tests
     means = predictor.inputs(h)[..., : car.m]  # plans take no more of what arrives in a step
     ahead = predictor.advance(h, x[:, None, :], means, predictor.data.time)[:, 0]
-    ahead = (
-        ahead + np.asarray(predictor.offset(h, ahead[:, None, :]))[..., 0, :]
-        if (effect.family.name.startswith("sensor"))
-        else ahead
-    )
-    carried = car.state_names.index(
-        "psi_rate"
-    )  # the heading's rate, by a short step in one of them
+    if effect.family.name.startswith("sensor"):
+        ahead = ahead + np.asarray(predictor.offset(h, ahead[:, None, :]))[..., 0, :]
+    carried = car.state_names.index("psi_rate")  # by a short step in one of them
     np.testing.assert_allclose(adopted[:, carried], ahead[:, carried], atol=1e-3)
     np.testing.assert_allclose(
         np.delete(adopted, carried, 1), np.delete(ahead, carried, 1), atol=2e-6

@@ -42,13 +42,8 @@ def built(parts, model=car):
 
 def late_data(model, base=car, steps=30):
     rng = np.random.default_rng(0)
-    one = Trial(
-        rng.uniform(0.2, 0.8, (steps + 1, base.n)),
-        rng.uniform(-0.5, 0.5, (steps, base.m)),
-        DT,
-        base.state_names,
-        base.input_names,
-    )
+    x, u = rng.uniform(0.2, 0.8, (steps + 1, base.n)), rng.uniform(-0.5, 0.5, (steps, base.m))
+    one = Trial(x, u, DT, base.state_names, base.input_names)
     states = np.hstack([one.states, memory_of(model, base, one)])
     lifted = replace(one, states=states, state_names=model.state_names)
     return prepare(model, [lifted], hidden=model.state_names[base.n :])

@@ -153,7 +153,6 @@ def two_channels() -> bytes:
     writer.finish()
     data = bytearray(stream.getvalue())
     for opcode in (4, 5):  # channel /b, and its messages, get the id of /a
-        length = 8
         at = 8
         while at < len(data) - 8:
             length = int.from_bytes(data[at + 1 : at + 9], "little")

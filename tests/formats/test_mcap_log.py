@@ -49,14 +49,11 @@ def test_a_trial_comes_back_exactly() -> None:
     assert back.inputs.tobytes() == trial.inputs.tobytes()
     assert back.start_inputs is not None and trial.start_inputs is not None
     assert back.start_inputs.tobytes() == trial.start_inputs.tobytes()
-    assert (back.dt, back.state_names, back.input_names) == (0.05, *names(trial))
+    assert (back.dt, back.state_names) == (0.05, trial.state_names)
+    assert back.input_names == trial.input_names
     assert back.candidate == "c0003" and len(back.id) == 64
     assert {k: found[k] for k in meta} == meta and policy == b"policy"
     assert json.loads(found["states"]) == {"v": "m/s", "x": "1", "psi": "1"}
-
-
-def names(trial: Trial) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    return trial.state_names, trial.input_names
 
 
 @pytest.mark.parametrize("feedback", [True, False])

@@ -44,15 +44,9 @@ def plain(T=40, **changes):
 def test_a_trial_of_ours_is_stored_byte_for_byte(w):
     path = run(w)
     found = ingest_log(w, path)
-    assert (w.folder / "trials").joinpath(
-        w.store.list()[0].path.name
-    ).read_bytes() == path.read_bytes()
-    assert (found.trial, found.candidate, found.known, found.accepted) == (
-        "t0001",
-        "c0001",
-        False,
-        True,
-    )
+    assert w.store.list()[0].path.read_bytes() == path.read_bytes()
+    assert (found.trial, found.candidate) == ("t0001", "c0001")
+    assert found.accepted is True and found.known is False
     assert found.utility == w.task.utility(read_trial(path)[0])
 
 
@@ -61,9 +55,8 @@ def test_a_simulated_run_is_a_function_of_the_seed_and_its_number(w):
     assert (first.name, again.name) == ("c0001-1.mcap", "c0001-2.mcap")
     assert first.read_bytes() == again.read_bytes()
     ingest_log(w, first)
-    assert (
-        run_candidate(w, "c0001").trial_file.read_bytes() != again.read_bytes()
-    )  # its number is in it
+    later = run_candidate(w, "c0001").trial_file  # its number is in it
+    assert later.read_bytes() != again.read_bytes()
 
 
 def test_a_trial_that_does_not_say_what_it_ran_is_the_outstanding_ones(w, tmp_path):

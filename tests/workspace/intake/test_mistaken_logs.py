@@ -1,7 +1,7 @@
 """Logs with two commands exchanged, or in percent: told at ingest, and before a diagnosis."""
 
 from dataclasses import replace
-from typing import NamedTuple
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -53,13 +53,6 @@ input = { port = { path = "/csv.port" }, starboard = { path = "/csv.starboard" }
 RNG = np.random.default_rng(0)
 
 
-class Crossed(NamedTuple):
-    """Commands that arrive at each other's motor."""
-
-    port: float
-    starboard: float
-
-
 T = np.arange(101) * 0.05
 TARGET = "t,v,psi\n" + "\n".join(f"{t:.2f},{0.3 * t:.4f},{0.2 * t:.4f}" for t in T) + "\n"
 
@@ -90,10 +83,13 @@ def written(path, rows, *columns):
 def run_crossed(w):
     """Plan a candidate and run it on a robot whose commands arrive at each other's motor."""
     plan, model = w.propose().candidate, w.base_model
-    crossed = replace(
-        model, derivative=lambda s, a, p: model.derivative(s, Crossed(a.starboard, a.port), p)
+
+    def crossed(s, a, p):
+        return model.derivative(s, SimpleNamespace(port=a.starboard, starboard=a.port), p)
+
+    ran = Plant(replace(model, derivative=crossed)).run(
+        plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG
     )
-    ran = Plant(crossed).run(plan.policy, dict.fromkeys(["v", "r", "psi"], 2e-3), RNG)
     return plan, ran, [0.05 * np.arange(ran.steps), ran.states[:-1]]
 
 
