@@ -75,7 +75,7 @@ def rows_of(path):
 def stored_from(w, path, before):
     """Return the last trial, the rows of its log and the row of each step, its commands checked."""
     stored, table = w.trials()[-1].trial, rows_of(path)
-    k = round(before * RATE) + 5 * np.arange(stored.steps)
+    k = round(before * RATE) + 5 * np.arange(w.task.horizon)  # all of the run
     np.testing.assert_allclose(stored.inputs[:, 0], table[k, 3], atol=1e-4)
     return stored, table, k
 
