@@ -43,7 +43,7 @@ def undisturbed(tmp_path_factory):
 @pytest.mark.slow
 def test_learn_killed_again_and_again_ends_where_it_would_have(tmp_path, undisturbed):
     folder = make(tmp_path / "w", config=NOISY).folder
-    count = killed(folder, "learn", longest=0.15, seed=1)
+    count = killed(folder, "learn", longest=0.08, seed=1)
     assert count > KILLS / 3  # or the kills came too late to prove anything
     assert kept(folder) == kept(undisturbed)
     a, b = (grounded("-C", f, "status", "--json").json for f in (folder, undisturbed))

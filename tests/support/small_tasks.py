@@ -67,7 +67,8 @@ def cart_task(**changes: Any) -> Task:
     target = np.column_stack([x, np.full(41, np.nan)])
     fields: dict[str, Any] = {"model": cart, "dt": DT, "target": target}
     fields |= {"state": [10.0, 0.0], "limit": 5.0, "effort": 0.01, "change": 0.01}
-    return plain_task(**fields | changes)
+    other = {"model": changes.pop("model")} if "model" in changes else {}
+    return replace(plain_task(**fields | changes), **other)
 
 
 def rover_task(**changes: Any) -> Task:
