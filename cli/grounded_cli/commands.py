@@ -167,7 +167,7 @@ def ingest() -> None:
     """
 
 
-@command(cli, "next", "ingest")
+@command(cli, "next")
 @argument("log", metavar="LOG")
 @which_candidate
 @details

@@ -1,4 +1,4 @@
-"""grounded ingest, next: store logs of the real system, and go on from them."""
+"""grounded ingest: store logs of the real system."""
 
 from __future__ import annotations
 
@@ -7,8 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import NextCommand
-from grounded.findings import Finding, Weight, found
+from grounded.findings import Finding, Weight
 from grounded_cli.console.options import json_asked, values_by_name
 from grounded_cli.console.terminal import (
     field,
@@ -19,10 +18,8 @@ from grounded_cli.console.terminal import (
     show,
     tell,
 )
-from grounded_cli.propose import tell_proposed
-from grounded_trials.logs.log_files import logs_in
+from grounded_trials.logs.log_paths import logs_in
 from grounded_trials.workspace.intake.ingest import Ingested
-from grounded_trials.workspace.looping import NextRun
 
 FINDINGS_TOLD = 3  # findings that are told without --details
 ASIDE = "set aside"  # a verdict
@@ -45,34 +42,12 @@ def ingest(
             done.append(workspace.ingest(name, **about))
         if not json_asked():  # each at once, since the next one may be refused
             earlier = [note for one in done[:-1] for note in one.findings]
-            _tell(name, done[-1], details, earlier)
+            tell_ingested(name, done[-1], details, earlier)
     yield {"trials": [one.to_json() for one in done]}
     show(f"\n{next_line(done[-1].then)}")
 
 
-def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRun]:
-    """Ingest a log, propose, and export for the robot."""
-    workspace = open_workspace()
-    with progress(f"reading {log} and planning"):
-        done = workspace.next(log, candidate=candidate)
-    yield done
-    _tell(log, done.taken, details)
-    if done.proposed is None:
-        trial, ran = done.taken.trial, done.taken.candidate
-        tell([found("search.discard_first", trial=trial, candidate=ran)], all_=True)
-        return show(next_line(done.taken.then))
-    show("")
-    tell_proposed(done.proposed)
-    if done.exported is None:
-        show(f"\n{next_line(done.proposed.then)}")
-    if done.exported is not None:
-        files = filter(None, (done.exported.file, done.exported.runner))
-        show(field("files", ", ".join(map(str, files)), "  "))
-        tell([found("search.to_robot", done.exported.candidate)], all_=True)
-        show(next_line(NextCommand("next", ("LOG",))))
-
-
-def _tell(name: str, one: Ingested, details: bool, earlier: Sequence[Finding] = ()) -> None:
+def tell_ingested(name: str, one: Ingested, details: bool, earlier: Sequence[Finding] = ()) -> None:
     """Print what became of a log; without details no note that was told of one before it."""
     if one.known:
         show(f"{name}: {one.trial}, stored before")

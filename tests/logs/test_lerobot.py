@@ -13,7 +13,7 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import log_files, logs_in
+from grounded_trials.logs.log_paths import log_files, logs_in
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from lerobot import FPS, dataset
 

@@ -17,7 +17,7 @@ from grounded_trials import Workspace
 from grounded_trials.formats.tables import npz_tables
 from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from workspaces import make
 

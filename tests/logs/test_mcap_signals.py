@@ -15,7 +15,7 @@ from bombs import log
 from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials.formats.message_path import Field
-from grounded_trials.logs.log_files import log_files
+from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import LogMapping, read_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
 from shared_data import data, files, needs_data

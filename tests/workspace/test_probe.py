@@ -8,9 +8,9 @@ import pytest
 from grounded.effects import Library
 from grounded.errors import NextCommand
 from grounded_trials import Workspace
-from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import checked_candidate
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
+from grounded_trials.workspace.next_step import to_run
 from reported import copied
 from workspaces import CONFIG, edit, make
 

@@ -199,7 +199,7 @@ class Workspace(Folder):
                 group and predicts that.
             before: inputs' values until the log's first row, which it then need not hold.
         """
-        from grounded_trials.logs.log_files import logs_in
+        from grounded_trials.logs.log_paths import logs_in
         from grounded_trials.workspace.intake.ingest import ingest_log
 
         about: dict[str, Any] = {"data": data, "group": group, "sent_before": before}

@@ -17,13 +17,12 @@ from grounded.policy import load
 from grounded_trials.workspace.candidates.exporting import (
     RUNNER,
     export_candidate,
-    exported_as,
-    to_run,
 )
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.ingest import ingest_log
+from grounded_trials.workspace.next_step import exported_as, to_run
 from workspaces import CONFIG, make
 
 

@@ -6,6 +6,6 @@ of any encoding as Python objects). `message_path.py` and `path_walk.py` extract
 `mcap_writer.py` writes; `protobuf.py` has the messages of our own files.
 
 `bags.py` (.db3, .bag) converts other bags to the same records. `tables.py` does so with tables, of
-which each format has a reader of one shape: there, and in `text_tables.py`, `parquet.py`, `mat.py`,
-`dataflash.py`.
+which each format has a reader of one shape: there, and in `text_tables.py`, `parquet.py` (with
+`lerobot.py`), `mat.py`, `dataflash.py`.
 """

@@ -1,17 +1,11 @@
 """Read parquet tables, and the episodes of LeRobot's data sets.
 
-A table's columns of numbers become the topic /parquet; lists of one length are arrays. A LeRobot
-data set is a folder with meta/info.json, which names the numbers of each feature; its episodes are
-files of their own (v2) or parts of common ones, which meta/episodes lists (v3). An episode has the
-path FOLDER/episode_000003, whatever the version. Its features become topics: /observation/state,
-and last /action. Images are not read.
-
-Source: `datasets/dataset_metadata.py` and `feature_utils.py` of huggingface/lerobot.
+A table's columns of numbers become the topic /parquet; lists of one length are arrays. The features
+of an episode (`lerobot`) become topics: /observation/state, and last /action. Images are not read.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -19,8 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.checks import wrong
-from grounded.errors import GroundedError
-from grounded.findings import found
+from grounded_trials.formats.lerobot import EPISODE, info_of, is_dataset
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
     Layout,
@@ -28,43 +21,12 @@ from grounded_trials.formats.tables import (
     column_name,
     columns_by_name,
 )
-from grounded_trials.plain_file import read_file
 
-EPISODE = re.compile(r"episode_(\d+)")
-INFO_LIMIT = 2**20  # [bytes] of a meta/info.json
-EPISODE_LIMIT = 10**6
 WIDEST = 100  # numbers of a list that is an array of signals; longer ones are pictures or scans
 COUNTED = ("frame_index", "episode_index", "index", "task_index", "timestamp")  # no signals
 FIRST, LAST = ("observation.state",), ("action",)  # order of the topics
 KEY = "episode_index"
 PLACES = {"data/chunk_index": "chunk_index", "data/file_index": "file_index"}  # in meta/episodes
-
-
-def is_dataset(folder: Path) -> bool:
-    """Check whether a folder is a LeRobot data set."""
-    return (folder / "meta" / "info.json").is_file()
-
-
-def is_episode(path: Path) -> bool:
-    """Check whether a path names an episode of a LeRobot data set."""
-    named = EPISODE.fullmatch(path.name) is not None
-    return named and is_dataset(path.parent) and not path.exists()
-
-
-def episodes(folder: Path) -> list[Path]:
-    """Return the paths of a data set's episodes, in order.
-
-    Raises:
-        GroundedError: if its meta/info.json can't be used.
-    """
-    return [folder / f"episode_{k:06d}" for k in range(int(_info(folder)["total_episodes"]))]
-
-
-def episode_files(path: Path) -> list[Path]:
-    """Return the files in which an episode may be, and which say where it is."""
-    folder = path.parent
-    alone = sorted(folder.glob(f"data/*/{path.name}.parquet"))
-    return alone or [*folder.glob("data/*/*.parquet"), *folder.glob("meta/episodes/*/*.parquet")]
 
 
 def parquet_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
@@ -88,7 +50,7 @@ def episode_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
         GroundedError: if the data set's meta/info.json can't be used, or it has no such episode.
     """
     folder, number = path.parent, int(path.name.partition("_")[2])
-    info = _info(folder)
+    info = info_of(folder)
     file = _file_of(folder, info, number)
     table = _read(file, filters=[(KEY, "=", number)]) if file else None
     if table is None or not len(table) or "frame_index" not in table.column_names:
@@ -108,30 +70,6 @@ def episode_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
             times_of = {"timestamp_s": times}
             tables["/" + key.replace(".", "/")] = times_of | columns_by_name(named, path)
     return tables
-
-
-def _info(folder: Path) -> dict[str, Any]:
-    """Return meta/info.json with all that is read of it.
-
-    Raises:
-        GroundedError: if something is missing.
-    """
-    path = folder / "meta" / "info.json"
-    try:
-        info = json.loads(read_file(path, INFO_LIMIT))
-        info = {"codebase_version": "", "chunks_size": 1000, **info}
-        needed = {"features": dict, "total_episodes": int, "fps": (int, float), "data_path": str}
-        bad = [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]  # type: ignore[arg-type]
-        if not bad:
-            kept = {key: one for key, one in info["features"].items() if isinstance(one, dict)}
-            bad += ["fps"] * (not info["fps"] > 0)
-            bad += ["total_episodes"] * (not 0 < info["total_episodes"] <= EPISODE_LIMIT)
-        if not bad:
-            return info | {"features": kept}
-        why = ", ".join(bad)
-    except (ValueError, TypeError, RecursionError) as error:
-        why = str(error)
-    raise GroundedError(found("file.unreadable", str(path), why=why, kind="LeRobot data set"))
 
 
 def _is_signal(feature: Mapping[str, Any]) -> bool:

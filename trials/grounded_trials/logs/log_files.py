@@ -1,45 +1,36 @@
-"""The files of a log, and the records of each, in any supported format.
+"""The records of a log's files (`log_paths`), in any supported format.
 
-A log is a file, several files in order, or a bag's folder with split files. The format is detected
-by the first bytes (`FORMATS`), not by the name, in a file compressed with zstd as well; else it is
-a text table. An episode of a LeRobot data set is a log whose path is no file: FOLDER/episode_000003
-(`parquet`). Every format is converted to MCAP records, so callers need not know it.
+The format is detected by the first bytes (`FORMATS`), not by the name, in a file compressed with
+zstd as well; else it is a text table. Every format is converted to MCAP records, so callers need
+not know it.
 """
 
 from __future__ import annotations
 
 import hashlib
-import re
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any, BinaryIO, Concatenate, ParamSpec, TypeVar
+from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 
-from grounded.errors import GroundedError, alike, needs
+from grounded.errors import GroundedError, needs
 from grounded.findings import found
-from grounded_trials.formats import dataflash, parquet, text_tables
-from grounded_trials.formats.mcap_records import MAGIC, Channel, Messages, Metadata, Record, Rows
+from grounded_trials.formats import dataflash, text_tables
+from grounded_trials.formats.lerobot import is_episode
+from grounded_trials.formats.mcap_records import MAGIC, Channel, Messages, Record, Rows
 from grounded_trials.formats.mcap_walk import mapped, read_records
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
-from grounded_trials.plain_file import open_file, read_file
+from grounded_trials.logs.log_paths import empty, log_files, on_disk, open_log
+from grounded_trials.plain_file import unreadable
+from grounded_trials.store.own_files import format_in, format_of
 from grounded_trials.within import within
 
 P = ParamSpec("P")
 T = TypeVar("T")
-BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
-KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".bin", ".mat", ".parquet")
-NAMED = 3  # most tables named of a folder that is no log
-LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _ZSTD = b"\x28\xb5\x2f\xfd"
-_LISTED = re.compile(
-    r"^[ \t]*-[ \t]+(?:path:[ \t]*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?[ \t\r]*$",
-    re.MULTILINE,
-)
-_NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a target
-_DIGITS = re.compile(r"(\d+)")
 
 
 @dataclass(frozen=True)
@@ -69,140 +60,6 @@ FORMATS = (
 )
 
 
-def logs_in(path: Path) -> list[Path]:
-    """Return the logs that a path names: the runs in a folder, or the path itself.
-
-    The runs are the episodes of a LeRobot data set, or the files of a folder that is no bag, if
-    its tables have equally many columns.
-
-    Raises:
-        GroundedError: if the data set can't be used.
-    """
-    if parquet.is_dataset(path):
-        return parquet.episodes(path)
-    if not path.is_dir() or (path / "grounded.toml").is_file() or _bag(path):
-        return [path]
-    runs = _sorted(p for p in _listed(path) if p.name.endswith(KINDS) and not _is_none(p))
-    return runs if runs and len({*map(_width, runs)}) == 1 else [path]
-
-
-def _width(path: Path) -> int:
-    """Return how many words the first line of a text table has, 0 for another file."""
-    if path.suffix not in SUFFIXES:
-        return 0
-    with open_log(path) as stream:
-        return len(re.split(rb"[\t;, ]+", stream.readline(LISTING_LIMIT).strip()))
-
-
-def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
-    """Return the files of a log in order.
-
-    Args:
-        paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml lists its
-            files in order; without it, all *.mcap, else *.db3, sorted by the numbers in their
-            names. Of a folder of runs, as a LeRobot data set, it is the first one.
-
-    Raises:
-        GroundedError: if a file is missing, or a folder has none.
-    """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
-    files: list[Path] = []
-    for path in map(Path, given):
-        if path.is_dir():
-            inside = [] if parquet.is_dataset(path) else _bag(path)
-            inside = inside or logs_in(path)[:1]
-            if inside == [path]:
-                workspace = int((path / "grounded.toml").is_file())
-                tables = () if workspace else sorted(p.name for p in _listed(path))
-                several = tuple(n for n in tables if n.endswith(".csv"))[:NAMED]
-                facts: dict[str, Any] = {"tables": several} if len(several) > 1 else {}
-                raise GroundedError(found("file.no_log", str(path), own=workspace, **facts))
-            files.extend(inside)
-        else:
-            files.append(path)
-    for path in files:
-        if not path.exists() and not parquet.is_episode(path):
-            raise _missing(path)
-    if not files:
-        raise GroundedError(found("file.missing", "log"))
-    return tuple(files)
-
-
-def _bag(folder: Path) -> list[Path]:
-    """Return the files of a bag in order, [] if a folder is none."""
-    listing = folder / "metadata.yaml"
-    try:
-        text = read_file(listing, LISTING_LIMIT).decode() if listing.exists() else ""
-    except (OSError, UnicodeDecodeError) as error:
-        raise _unreadable(folder, str(error), "bag") from None
-    names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
-    if names:  # names only: a listing can't lead out of its folder
-        missing = [name for name in names if not (folder / name).exists()]
-        if missing:
-            raise GroundedError(found("file.missing", missing[0], where=str(listing)))
-        return [folder / name for name in names]
-    there = _listed(folder)
-    bags = ([p for p in there if p.name.endswith(kind)] for kind in BAGS)
-    return _sorted(next((paths for paths in bags if paths), []))
-
-
-def _listed(folder: Path) -> list[Path]:
-    try:
-        return [*folder.iterdir()]
-    except OSError as error:
-        raise _unreadable(folder, str(error), "bag") from None
-
-
-def _sorted(paths: Iterable[Path]) -> list[Path]:
-    """Sort files by the numbers in their names: bag_2 before bag_10."""
-
-    def natural(path: Path) -> list[tuple[int, str]]:
-        parts = _DIGITS.split(path.name)
-        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
-
-    return sorted(paths, key=natural)
-
-
-def _is_none(path: Path) -> bool:
-    """Check whether a file is named like an exported candidate or a target, which are no logs."""
-    return _NO_LOG.fullmatch(path.name) is not None
-
-
-def _missing(path: Path) -> GroundedError:
-    """Return the error for a file that does not exist, with the log that it may stand for."""
-    if not path.parent.is_dir():
-        return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
-    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and not _is_none(p)]
-    named = {p.stem: p.name for p in sorted(there)}  # endings make all names alike
-    close = named.get(alike(path.stem, named), "")
-    return GroundedError(found("file.missing", str(path), near=close))
-
-
-def _unreadable(path: Path, why: str, kind: str = "") -> GroundedError:
-    return GroundedError(found("file.unreadable", str(path), why=why, kind=kind))
-
-
-def open_log(path: Path) -> BinaryIO:
-    """Open a log for reading.
-
-    Raises:
-        GroundedError: if it can't be opened, or is not a regular file (a pipe, a device).
-    """
-    try:
-        return open_file(path)
-    except FileNotFoundError:
-        raise _missing(path) from None
-    except IsADirectoryError:
-        raise _unreadable(path, "folder") from None
-    except OSError as error:
-        raise _unreadable(path, str(error.strerror)) from None
-
-
-def empty(path: Path) -> GroundedError:
-    """Return the error for a log without a single byte."""
-    return GroundedError(found("file.no_message", str(path), byte=0))
-
-
 def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of one file of any supported format; only in `read_apart`.
 
@@ -213,7 +70,7 @@ def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     Raises:
         GroundedError: if it can't be read, is damaged, or is not a log.
     """
-    if parquet.is_episode(path):
+    if is_episode(path):
         yield from _read_as(EPISODE, path, layout)
         return
     with open_log(path) as stream:
@@ -266,7 +123,7 @@ def _guarded(kind: str, path: Path, records: Iterator[Record]) -> Iterator[Recor
         raise
     except Exception as error:  # a decoder raises whatever a damaged file leads to
         why = f"{type(error).__name__}: {error}"
-        raise _unreadable(path, why[:500], kind) from error
+        raise unreadable(path, why[:500], kind=kind) from error
 
 
 def _plain(record: Record) -> Record:
@@ -292,7 +149,7 @@ def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
         with target.open("wb") as out:
             decoder.copy_stream(stream, out)
     except (zstandard.ZstdError, OSError) as error:
-        raise _unreadable(path, str(error), "zstd file") from error
+        raise unreadable(path, str(error), kind="zstd file") from error
 
 
 def read_apart(
@@ -313,14 +170,9 @@ def read_apart(
     return within(files[0], size, function, files, *args, **kwargs)
 
 
-def on_disk(log: Path) -> list[Path]:
-    """Return the files on the disk that a log's file is read from; several for an episode."""
-    return parquet.episode_files(log) if parquet.is_episode(log) else [log]
-
-
 def _load_library(file: Path) -> None:
     """Import the library that reads a file: its own memory is then not counted as the file's."""
-    if parquet.is_episode(file):
+    if is_episode(file):
         format: Format | None = EPISODE
     else:
         with open_log(file) as stream:
@@ -368,28 +220,16 @@ def _digest(files: tuple[Path, ...]) -> str:
 
 
 def kind_of(path: Path) -> str:
-    """Return the `format` stated in a file written by grounded, "" for any other file.
-
-    Damage is ignored here; it is reported when the file is read.
-    """
+    """Return the `format` of a file written by grounded, compressed or not, see `format_of`."""
+    if kind := format_of(path):
+        return kind
     try:
         with open_log(path) as stream:
-            head = stream.read(len(MAGIC))
-            if head == MAGIC:
-                return _stated(read_records(mapped(stream), str(path), packed=False))
-        return read_apart(path, _stated_packed) if head.startswith(_ZSTD) else ""
+            packed = stream.read(len(_ZSTD)) == _ZSTD
+        return read_apart(path, _packed_format) if packed else ""
     except GroundedError:
         return ""
 
 
-def _stated_packed(files: tuple[Path, ...]) -> str:
-    return _stated(log_records(files[0]))
-
-
-def _stated(records: Iterator[Record]) -> str:
-    for record in records:
-        if isinstance(record, Metadata) and record.name == "grounded":
-            return record.data.get("format", "")
-        if isinstance(record, Messages):
-            return ""
-    return ""
+def _packed_format(files: tuple[Path, ...]) -> str:
+    return format_in(log_records(files[0]))

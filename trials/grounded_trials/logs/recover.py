@@ -51,7 +51,7 @@ from grounded_trials.formats.mcap_records import (
 )
 from grounded_trials.formats.mcap_walk import Data, again, chunk_records, mapped, message_positions
 from grounded_trials.formats.mcap_writer import McapWriter
-from grounded_trials.logs.log_files import empty, open_log
+from grounded_trials.logs.log_paths import empty, open_log
 from grounded_trials.store.store import sync_folder
 from grounded_trials.within import within
 

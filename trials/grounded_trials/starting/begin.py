@@ -30,7 +30,8 @@ from grounded_trials.logs.inspection.guess import Guess, mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.joint_names import joint_names
 from grounded_trials.logs.inspection.names import PARTS
-from grounded_trials.logs.log_files import kind_of, log_files
+from grounded_trials.logs.log_files import kind_of
+from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.logs.stated_units import Stated
 from grounded_trials.starting.examples import fresh_folder

@@ -19,7 +19,8 @@ from grounded.model import Model
 from grounded.places import velocities
 from grounded.result import UNSAID, Document
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import kind_of, log_files
+from grounded_trials.logs.log_files import kind_of
+from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.shapes import (
     PATHS,

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,16 +22,18 @@ from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded_trials.formats.bad import BadSchema
 from grounded_trials.formats.mcap_records import (
+    MAGIC,
     Attachment,
     Channel,
     End,
     Messages,
     Metadata,
+    Record,
     Schema,
 )
-from grounded_trials.formats.mcap_walk import DamagedFile, read_records
+from grounded_trials.formats.mcap_walk import DamagedFile, mapped, read_records
 from grounded_trials.formats.protobuf import double_tag, doubles_tag, numbers_in, uniform_doubles
-from grounded_trials.plain_file import read_file, unreadable
+from grounded_trials.plain_file import open_file, read_file, unreadable
 
 FILE_LIMIT = 1 * 2**30  # [bytes]
 NAME_LIMIT = 1000  # number of states or of inputs
@@ -164,6 +166,30 @@ class OwnFile:
         k = int(np.argmax(off))
         facts = {"sample": str(k), "at": times[k], "expected": k * dt, "dt": dt, "robot": 1}
         raise refused("file.grid", f"{self.name}: {topic}", **facts)
+
+
+def format_of(path: Path) -> str:
+    """Return the `format` stated in a file written by grounded, "" for any other file.
+
+    Damage is ignored here; it is reported when the file is read.
+    """
+    try:
+        with open_file(path) as stream:
+            if stream.read(len(MAGIC)) == MAGIC:
+                return format_in(read_records(mapped(stream), str(path), packed=False))
+    except (OSError, GroundedError):
+        pass
+    return ""
+
+
+def format_in(records: Iterable[Record]) -> str:
+    """Return the `format` stated before the first messages among some records, or ""."""
+    for record in records:
+        if isinstance(record, Metadata) and record.name == "grounded":
+            return record.data.get("format", "")
+        if isinstance(record, Messages):
+            break
+    return ""
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:

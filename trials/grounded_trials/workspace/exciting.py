@@ -19,10 +19,10 @@ from grounded.search.noise import sensor_noise
 from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.candidates.at_rest import resting
-from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.first_plan import idle_inputs, no_effect
 from grounded_trials.workspace.diagnosing import near, probe_candidate
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.next_step import to_run
 
 LENGTHS = (5.0, 10.0, 20.0, 40.0)  # [s] that are tried until no parameter stays weak
 

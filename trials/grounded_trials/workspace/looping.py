@@ -17,7 +17,6 @@ from grounded_trials.plain_file import path_of
 from grounded_trials.workspace.candidates.exporting import (
     Exported,
     export_candidate,
-    exported_as,
 )
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -25,6 +24,7 @@ from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake.gone_wrong import went_as_planned
 from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
+from grounded_trials.workspace.next_step import exported_as
 
 MOST_TRIALS = 100_000
 

@@ -14,7 +14,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.search.standing import LOST, Ending, Phase, Standing
-from grounded_trials.workspace.candidates.exporting import to_run
+from grounded_trials.store.store import DIGITS, hash_file
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
@@ -31,7 +31,41 @@ if TYPE_CHECKING:
 DIAGNOSE, FIT = NextCommand("diagnose"), NextCommand("fit", ("--apply",))
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
+FORMS = ("csv", "json", "npz")  # in which a candidate is exported
 BEFORE_TRIALS = ("adopt", "discard")  # verbs of commands that come before another trial
+
+
+def exported_as(workspace: Folder, name: str) -> str:
+    """Return the format in which a candidate was exported here or to the workspace; "" for none."""
+    places = (at / f"{name}.{form}" for form in FORMS for at in (workspace.folder, Path()))
+    return next((path.suffix[1:] for path in places if path.is_file()), "")
+
+
+def not_stored(workspace: Folder, candidate: str) -> Path | None:
+    """Return the trial file of the last `run` of a candidate if it was not ingested yet."""
+    files = [*(workspace.folder / "runs").glob(f"{candidate}-*.mcap")]
+    last = max(files, key=lambda path: (len(path.name), path.name), default=None)
+    stored = last is None or hash_file(last)[:DIGITS] in workspace.store.digests()
+    return None if stored else last
+
+
+def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
+    """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
+
+    A run that was not ingested yet is ingested first.
+
+    Args:
+        workspace: the workspace.
+        candidate: the candidate's id.
+        named: the name to use in the command; () for the outstanding candidate.
+    """
+    if workspace.config.reachable:
+        waits = not_stored(workspace, candidate)
+        return NextCommand("run", named) if waits is None else NextCommand("ingest", (str(waits),))
+    name = named[0] if named else candidate
+    if exported_as(workspace, name):
+        return NextCommand("next", ("LOG", "--candidate", candidate) if named else ("LOG",))
+    return NextCommand("export", (name, "--runner"))
 
 
 @dataclass(frozen=True, eq=False)

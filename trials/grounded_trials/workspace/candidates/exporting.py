@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -23,12 +23,12 @@ import numpy as np
 from grounded import onboard
 from grounded.checks import known as among
 from grounded.checks import one_of, refused
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.policy import Policy, to_arrays
 from grounded.result import UNSAID, Document
 from grounded.search.standing import Ending, Phase, Standing
-from grounded_trials.store.store import DIGITS, hash_file, write_atomically
+from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.candidates.handover import checked_candidate
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
@@ -37,20 +37,10 @@ from grounded_trials.workspace.candidates.search_state import (
 )
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unknown_candidate, unknown_trial
+from grounded_trials.workspace.next_step import FORMS
 
 LAW = "u_t = clip(feedforward_t + gain_t (z - reference_t), low, high); z = [state, past inputs]"
 OPEN_LOOP = "u_t = clip(feedforward_t, low, high)"  # no gain and no reference
-
-
-def exported_as(workspace: Folder, name: str) -> str:
-    """Return the format in which a candidate was exported here or to the workspace; "" for none."""
-    places = (at / f"{name}.{form}" for form in encoders() for at in (workspace.folder, Path()))
-    return next((path.suffix[1:] for path in places if path.is_file()), "")
-
-
-def encoders() -> dict[str, Callable[[Policy, dict[str, Any]], bytes]]:
-    """Return the functions that write a policy, and what is said of it (`_said`), by format."""
-    return {"csv": _csv, "json": _json, "npz": _npz}
 
 
 def _said(
@@ -117,33 +107,6 @@ def _csv(policy: Policy, said: dict[str, Any]) -> bytes:
     for step, row in enumerate(np.hstack(columns).tolist()):
         writer.writerow([f"{step * policy.dt:.10g}", *map(repr, row)])
     return stream.getvalue().encode()
-
-
-def not_stored(workspace: Folder, candidate: str) -> Path | None:
-    """Return the trial file of the last `run` of a candidate if it was not ingested yet."""
-    files = [*(workspace.folder / "runs").glob(f"{candidate}-*.mcap")]
-    last = max(files, key=lambda path: (len(path.name), path.name), default=None)
-    stored = last is None or hash_file(last)[:DIGITS] in workspace.store.digests()
-    return None if stored else last
-
-
-def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
-    """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
-
-    A run that was not ingested yet is ingested first.
-
-    Args:
-        workspace: the workspace.
-        candidate: the candidate's id.
-        named: the name to use in the command; () for the outstanding candidate.
-    """
-    if workspace.config.reachable:
-        waits = not_stored(workspace, candidate)
-        return NextCommand("run", named) if waits is None else NextCommand("ingest", (str(waits),))
-    name = named[0] if named else candidate
-    if exported_as(workspace, name):
-        return NextCommand("next", ("LOG", "--candidate", candidate) if named else ("LOG",))
-    return NextCommand("export", (name, "--runner"))
 
 
 RUNNER = "grounded_runner.py"
@@ -234,7 +197,7 @@ def export_candidate(
     Without `form` the ending of `path` decides the format; without one it is npz with `runner`,
     else json.
     """
-    known = encoders()
+    known = dict(zip(FORMS, (_csv, _json, _npz), strict=True))
     form = form or format_of(path, tuple(known), "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
     among("format", [form], known)

@@ -16,7 +16,6 @@ from grounded.search.noise import known_noise, noise_cost, noise_missed
 from grounded.search.standing import Ending, Phase
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates import trust
-from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import (
     INSPECT,
     Void,
@@ -35,7 +34,7 @@ from grounded_trials.workspace.candidates.search_state import (
 from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import Since, left_out
-from grounded_trials.workspace.next_step import Situation, outlook
+from grounded_trials.workspace.next_step import Situation, outlook, to_run
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:

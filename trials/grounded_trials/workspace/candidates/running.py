@@ -22,10 +22,10 @@ from grounded.result import UNSAID, Document
 from grounded.trusted import check_own
 from grounded_trials.store.store import made_folder
 from grounded_trials.store.trial_file import write_trial
-from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.handover import Handed, checked_candidate
 from grounded_trials.workspace.candidates.search_state import candidate_named
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.next_step import to_run
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 

@@ -27,8 +27,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.standing import Phase, Standing
 from grounded.task import Task
 from grounded.trial import HUGE, Trial, interpolate_gaps
-from grounded_trials.logs.log_files import kind_of
-from grounded_trials.store.own_files import CANDIDATE, TRIAL
+from grounded_trials.store.own_files import CANDIDATE, TRIAL, format_of
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
@@ -125,7 +124,7 @@ def ingest_log(
     With `ahead` the next candidate is planned if the next command depends on it, see `standing_in`.
     """
     candidate = candidate and candidate_named(workspace, candidate)
-    kind = "" if path.is_dir() else kind_of(path)
+    kind = format_of(path)
     if kind == CANDIDATE:
         raise refused("file.no_log", path, head=f"candidate {path.stem}")
     if candidate is not None and data:

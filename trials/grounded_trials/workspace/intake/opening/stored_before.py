@@ -16,12 +16,12 @@ from grounded.checks import refused
 from grounded.errors import NextCommand
 from grounded.search.standing import Phase
 from grounded.trial import Trial, scattered
-from grounded_trials.logs.log_files import log_files, on_disk
+from grounded_trials.logs.log_paths import log_files, on_disk
 from grounded_trials.store.trial_file import read_trial
-from grounded_trials.workspace.candidates.exporting import to_run
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import ESTIMATED_WITH, StoredTrial, sha256
+from grounded_trials.workspace.next_step import to_run
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog

@@ -1,0 +1,164 @@
+"""The files of a log: a file, several files in order, or a bag's folder with split files.
+
+An episode of a LeRobot data set is a log whose path is no file: FOLDER/episode_000003 (`lerobot`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, BinaryIO
+
+from grounded.errors import GroundedError, alike
+from grounded.findings import found
+from grounded_trials.formats import lerobot
+from grounded_trials.plain_file import open_file, read_file, unreadable
+
+BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
+KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".bin", ".mat", ".parquet")
+NAMED = 3  # most tables named of a folder that is no log
+LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
+_LISTED = re.compile(
+    r"^[ \t]*-[ \t]+(?:path:[ \t]*)?[\"']?([^\"'\s#]+\.(?:mcap|db3)(?:\.zstd)?)[\"']?[ \t\r]*$",
+    re.MULTILINE,
+)
+_NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a target
+_DIGITS = re.compile(r"(\d+)")
+
+
+def logs_in(path: Path) -> list[Path]:
+    """Return the logs that a path names: the runs in a folder, or the path itself.
+
+    The runs are the episodes of a LeRobot data set, or the files of a folder that is no bag, if
+    its tables have equally many columns.
+
+    Raises:
+        GroundedError: if the data set can't be used.
+    """
+    if not path.is_dir():
+        return [path]
+    if lerobot.is_dataset(path):
+        return lerobot.episodes(path)
+    if (path / "grounded.toml").is_file() or _bag(path):
+        return [path]
+    runs = _sorted(p for p in _listed(path) if p.name.endswith(KINDS) and not _is_none(p))
+    return runs if runs and len({*map(_width, runs)}) == 1 else [path]
+
+
+def _width(path: Path) -> int:
+    """Return how many words the first line of a text table has, 0 for another file."""
+    if path.suffix != ".csv":
+        return 0
+    with open_log(path) as stream:
+        return len(re.split(rb"[\t;, ]+", stream.readline(LISTING_LIMIT).strip()))
+
+
+def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
+    """Return the files of a log in order.
+
+    Args:
+        paths: a file, files in order, or the folder of a bag. A folder's metadata.yaml lists its
+            files in order; without it, all *.mcap, else *.db3, sorted by the numbers in their
+            names. Of a folder of runs, as a LeRobot data set, it is the first one.
+
+    Raises:
+        GroundedError: if a file is missing, or a folder has none.
+    """
+    given = [paths] if isinstance(paths, str | Path) else list(paths)
+    files: list[Path] = []
+    for path in map(Path, given):
+        if path.is_dir():
+            inside = [] if lerobot.is_dataset(path) else _bag(path)
+            inside = inside or logs_in(path)[:1]
+            if inside == [path]:
+                workspace = int((path / "grounded.toml").is_file())
+                tables = () if workspace else sorted(p.name for p in _listed(path))
+                several = tuple(n for n in tables if n.endswith(".csv"))[:NAMED]
+                facts: dict[str, Any] = {"tables": several} if len(several) > 1 else {}
+                raise GroundedError(found("file.no_log", str(path), own=workspace, **facts))
+            files.extend(inside)
+        else:
+            files.append(path)
+    for path in files:
+        if not path.exists() and not lerobot.is_episode(path):
+            raise _missing(path)
+    if not files:
+        raise GroundedError(found("file.missing", "log"))
+    return tuple(files)
+
+
+def _bag(folder: Path) -> list[Path]:
+    """Return the files of a bag in order, [] if a folder is none."""
+    listing = folder / "metadata.yaml"
+    try:
+        text = read_file(listing, LISTING_LIMIT).decode() if listing.exists() else ""
+    except (OSError, UnicodeDecodeError) as error:
+        raise unreadable(folder, str(error), kind="bag") from None
+    names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
+    if names:  # names only: a listing can't lead out of its folder
+        missing = [name for name in names if not (folder / name).exists()]
+        if missing:
+            raise GroundedError(found("file.missing", missing[0], where=str(listing)))
+        return [folder / name for name in names]
+    there = _listed(folder)
+    bags = ([p for p in there if p.name.endswith(kind)] for kind in BAGS)
+    return _sorted(next((paths for paths in bags if paths), []))
+
+
+def _listed(folder: Path) -> list[Path]:
+    try:
+        return [*folder.iterdir()]
+    except OSError as error:
+        raise unreadable(folder, str(error), kind="bag") from None
+
+
+def _sorted(paths: Iterable[Path]) -> list[Path]:
+    """Sort files by the numbers in their names: bag_2 before bag_10."""
+
+    def natural(path: Path) -> list[tuple[int, str]]:
+        parts = _DIGITS.split(path.name)
+        return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
+
+    return sorted(paths, key=natural)
+
+
+def _is_none(path: Path) -> bool:
+    """Check whether a file is named like an exported candidate or a target, which are no logs."""
+    return _NO_LOG.fullmatch(path.name) is not None
+
+
+def _missing(path: Path) -> GroundedError:
+    """Return the error for a file that does not exist, with the log that it may stand for."""
+    if not path.parent.is_dir():
+        return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
+    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and not _is_none(p)]
+    named = {p.stem: p.name for p in sorted(there)}  # endings make all names alike
+    close = named.get(alike(path.stem, named), "")
+    return GroundedError(found("file.missing", str(path), near=close))
+
+
+def open_log(path: Path) -> BinaryIO:
+    """Open a log for reading.
+
+    Raises:
+        GroundedError: if it can't be opened, or is not a regular file (a pipe, a device).
+    """
+    try:
+        return open_file(path)
+    except FileNotFoundError:
+        raise _missing(path) from None
+    except IsADirectoryError:
+        raise unreadable(path, "folder") from None
+    except OSError as error:
+        raise unreadable(path, error) from None
+
+
+def empty(path: Path) -> GroundedError:
+    """Return the error for a log without a single byte."""
+    return GroundedError(found("file.no_message", str(path), byte=0))
+
+
+def on_disk(log: Path) -> list[Path]:
+    """Return the files on the disk that a log's file is read from; several for an episode."""
+    return lerobot.episode_files(log) if lerobot.is_episode(log) else [log]
