@@ -16,50 +16,110 @@ from grounded.diagnosis.likelihood.noise import (
     working,
 )
 from grounded.filter import kalman, kernels
-from grounded.filter.augmented import coloured
+from grounded.filter.augmented import Delayed, coloured
 from grounded.filter.kalman import innovations, smoother
 from grounded.filter.tempering import tempering
+from stepped import slopes
 
 L, B = 150, 2
+# states, noise through G, colour, missing samples
 CASES = [
     (2, False, None, False),
     (3, True, None, False),
     (3, True, 0.8, True),
     (6, False, 0.9, True),
 ]
+# the same, late channels of each run, p of each (or a, b, c)
+LATE = [
+    (3, False, 0.8, True, [[0], [2]], [[0.4], [0.9]]),
+    (3, True, 0.9, True, [[0, 2], [0, 1]], [[0.0, 0.7], [0.4, 0.4]]),
+    (3, True, None, True, [[2, 1], [2, 1]], [[0.5, 0.2], [0.1, 0.3]]),
+    (3, True, None, False, [[1], [1]], [[(0.2, 0.1, 0.7)], [(0.4, 0.3, 0.3)]]),
+    (3, True, 0.9, True, [[0, 2], [0, 1]], [[(0.7, 0.3, 0.0), (0.2, 0.1, 0.7)]] * 2),
+]
 
 
 class Problem:
-    """A random linear system with noise that may enter through G, be coloured, be missed."""
+    """A random linear system with noise that may enter through G, be coloured, be missed.
 
-    def __init__(self, n, through, phi, missing):
+    Some channels may be late by part of a step, or filtered.
+    """
+
+    def __init__(self, n, through, phi, missing, channel=None, part=(), steps=L):
         rng = np.random.default_rng(n)
-        self.n, F = n, 0.95 * np.eye(n) + 0.05 * rng.standard_normal((L, B, n, n))
+        self.n, self.L, self.phi, self.late = n, steps, phi, None
+        if channel is not None:
+            weights = [
+                [w if isinstance(w, tuple) else (1 - w, w, 0.0) for w in run] for run in part
+            ]
+            self.late = Delayed(np.array(channel), np.array(weights))
+        self.F = 0.95 * np.eye(n) + 0.05 * rng.standard_normal((steps, B, n, n))
         self.G = None
         if through:
-            self.G = np.tile(np.eye(n), (L, B, 1, 1))
-            self.G[:, :, n - 1, : n - 1] = 3 * rng.standard_normal((L, B, n - 1))
-        self.A = coloured(F, phi, self.G)
+            self.G = np.tile(np.eye(n), (steps, B, 1, 1))
+            self.G[:, :, n - 1, : n - 1] = 3 * rng.standard_normal((steps, B, n - 1))
+        self.A = coloured(self.F, phi, self.G)
         self.N = self.A.shape[-1]
-        self.seen = np.ones((L + 1, B, n))
+        self.seen = np.ones((steps + 1, B, n))
         if missing:
-            self.seen[1:] = rng.random((L, B, n)) > 0.2
-            self.seen[-10:, 1] = 0.0
-        self.d = 0.1 * rng.standard_normal((L, B, n, 3))
-        self.r = rng.standard_normal((L + 1, B, n, 3))
+            self.seen[1:] = rng.random((steps, B, n)) > 0.2
+            self.seen[-(steps // 15 + 1) :, 1] = 0.0
+        self.d = 0.1 * rng.standard_normal((steps, B, n, 3))
+        self.r = rng.standard_normal((steps + 1, B, n, 3))
         self.q = 0.1 * np.exp(rng.standard_normal(self.N))
         self.v = 0.1 * np.exp(rng.standard_normal(n))
+        self.start = np.ones((B, self.N))
+        self.start[:, :n] = self.v  # the start is given
 
     def passes(self, q, v):
-        start = np.ones((B, self.N))
-        start[:, : self.n] = self.v  # the start is given
-        g = kalman.gains(kalman.LinearSystem(self.A, q, v, self.seen, start, self.G))
+        q = np.broadcast_to(q, (self.L, B, self.N))
+        v = np.broadcast_to(v, (self.L + 1, B, self.n))
+        system = kalman.LinearSystem(self.A, q, v, self.seen, self.start, self.G)
+        g = kalman.gains(system, self.late)
         white, track = innovations(g, self.d, self.r, track=True)
         return g, white, track, smoother(g, white[..., 0])
 
     def loglik(self, q, v):
         g, white, *_ = self.passes(q, v)
         return -0.5 * float((white[..., 0] ** 2).sum() + g.logdet.sum())
+
+    def dense(self, b):
+        """What run b measures from step 1, as one normal vector of all sources of noise.
+
+        Returns answers (samples, sources), their variances, the noise that each source is of (-1:
+        the start), the channel of each sample, and what is measured beyond the mean.
+        """
+        n, N = self.n, self.N
+        G = np.tile(np.eye(n), (self.L, 1, 1)) if self.G is None else self.G[:, b]
+        first = self.start[b].copy()
+        power = self.q[:n] + (self.start[b, n:] if n < N else 0.0)
+        weights = {}
+        if self.late is not None:
+            weights = dict(zip(self.late.channel[b], self.late.weights[b], strict=True))
+        for i, (now, _, kept) in weights.items():
+            first[i] += (1 - now) ** 2 / (1 - kept**2) * float(G[0][i] ** 2 @ power)
+        variances = np.array([*first, *np.tile(self.q, self.L), *self.v])
+        kind = np.array([-1] * N + [*range(N)] * self.L + [-1] * n)
+        sources = len(variances)
+        shown = np.eye(n, sources, sources - n)  # what was shown at first is known by itself
+        e, c = np.eye(n, sources), np.eye(n, sources, n) * (n < N)
+        mean = self.r[0, b, :, 0] * self.seen[0, b]
+        mean_shown, rows, missed, channel = mean.copy(), [], [], []
+        for t in range(self.L):
+            before, mean_before, at = e, mean, N * (t + 1)
+            e = self.F[t, b] @ e + G[t] @ (c + np.eye(n, sources, at))
+            mean = self.F[t, b] @ mean + self.d[t, b, :, 0]
+            if n < N:
+                c = self.phi * c + np.eye(n, sources, at + n)
+            for i in range(n):
+                w = weights.get(i, (1.0, 0.0, 0.0))
+                shown[i] = w @ np.array([e[i], before[i], shown[i]])
+                mean_shown[i] = w @ np.array([mean[i], mean_before[i], mean_shown[i]])
+                if self.seen[t + 1, b, i]:
+                    rows.append(shown[i].copy())
+                    missed.append(self.r[t + 1, b, i, 0] - mean_shown[i])
+                    channel.append(i)
+        return np.array(rows), variances, kind, np.array(channel), np.array(missed)
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -68,20 +128,31 @@ def test_smoother_gives_the_slope_of_the_likelihood_after_many_steps(case, monke
     for compiled in (True, False):
         if not compiled:
             monkeypatch.setattr(kernels, "available", lambda n, N: False)
-        back = problem.passes(problem.q, problem.v)[3]
-        of_q = 0.5 * (problem.q * (back.r**2 - back.N)).sum(axis=(0, 1))
-        of_v = 0.5 * (problem.v * (back.u**2 - back.D)).sum(axis=(0, 1))
-        for at, slope in enumerate([*of_q, *of_v]):
-            found = []
-            for sign in (-1, 1):
-                logs = np.zeros(problem.N + problem.n)
-                logs[at] = 1e-4 * sign
-                q, v = problem.q * np.exp(logs[: problem.N]), problem.v * np.exp(logs[problem.N :])
-                found.append(problem.loglik(q, v))
-            assert slope == pytest.approx((found[1] - found[0]) / 2e-4, rel=1e-3, abs=0.01)
+        slopes_are_right(problem, 0)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", LATE[1::3])
+def test_smoother_gives_the_slope_where_channels_are_late(case):
+    slopes_are_right(Problem(*case, steps=40), 1)  # the first step's noise is part of the start
+
+
+def slopes_are_right(problem, first):
+    back = problem.passes(problem.q, problem.v)[3]
+    of_q = 0.5 * (problem.q * (back.r**2 - back.N))[first:].sum(axis=(0, 1))
+    of_v = 0.5 * (problem.v * (back.u**2 - back.D)).sum(axis=(0, 1))
+
+    def loglik(logs):
+        Q = np.tile(problem.q, (problem.L, B, 1))
+        R = np.tile(problem.v, (problem.L + 1, B, 1))
+        Q[first:] *= np.exp(logs[: problem.N])
+        R[1:] *= np.exp(logs[problem.N :])
+        return problem.loglik(Q, R)
+
+    found = slopes(loglik, np.zeros(problem.N + problem.n), 1e-4)
+    assert found == pytest.approx(np.array([*of_q, *of_v]), rel=1e-3, abs=0.01)
+
+
+@pytest.mark.parametrize("case", [*CASES, *((*case, 12) for case in LATE[1:])])
 def test_kernels_and_numpy_agree(case, monkeypatch):
     problem = Problem(*case)
     fast = problem.passes(problem.q, problem.v)
@@ -90,10 +161,25 @@ def test_kernels_and_numpy_agree(case, monkeypatch):
     for name in ("k", "weight", "logdet"):
         assert np.allclose(getattr(fast[0], name), getattr(slow[0], name), rtol=1e-9, atol=1e-11)
     for one, other in zip(fast[1:3], slow[1:3], strict=True):
-        assert np.allclose(one, other, rtol=1e-9, atol=1e-9)
+        assert np.allclose(one, other, rtol=1e-8, atol=1e-8)
     for name in ("u", "D", "r", "N"):
         one, other = getattr(fast[3], name), getattr(slow[3], name)
         assert np.allclose(one, other, rtol=1e-8, atol=1e-8 * np.abs(other).max())
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("case", [*CASES[:3], *LATE[::2]])
+def test_the_likelihood_is_that_of_all_measurements_together(case, compiled, monkeypatch):
+    problem = Problem(*case[:4], *(case[4:] or (None, ())), steps=12)
+    if not compiled:
+        monkeypatch.setattr(kernels, "available", lambda n, N: False)
+    g, white, *_ = problem.passes(problem.q, problem.v)
+    found = -0.5 * ((white[..., 0] ** 2).sum(axis=(0, 2)) + g.logdet.sum(axis=0))
+    for b in range(B):
+        H, variances, _, channel, nu = problem.dense(b)
+        S = (H * variances) @ H.T + np.diag(problem.v[channel])
+        expected = -0.5 * float(nu @ np.linalg.solve(S, nu) + np.linalg.slogdet(S)[1])
+        assert found[b] == pytest.approx(expected, rel=1e-9)
 
 
 def test_a_covariance_that_is_not_finite_is_an_error():
@@ -118,47 +204,16 @@ def information(problem, noise, dt=0.05):
     return average(innovations(g, d, r)[0]), back
 
 
-def dense(problem):
-    """By run: covariance of all that was measured, its part from each noise, the residual."""
-    n, N, A = problem.n, problem.N, problem.A
-    for b in range(B):
-        rows, there = np.zeros((L, n, N)), problem.seen[1:, b].reshape(-1) > 0
-        z, drift = np.eye(N), np.zeros((L, n))
-        e = np.concatenate([problem.r[0, b, :, 0] * problem.seen[0, b], np.zeros(N - n)])
-        for t in range(L):
-            z, e = A[t, b] @ z, A[t, b] @ e
-            e[:n] += problem.d[t, b, :, 0]
-            rows[t], drift[t] = z[:n], e[:n]
-        first = np.concatenate([problem.v, np.ones(N - n)])
-        start = rows.reshape(-1, N) * np.sqrt(first)
-        whole, parts = start @ start.T, []
-        for i in range(N):
-            answers = np.zeros((L, L, n))
-            for t in range(L):
-                unit = np.zeros(N)
-                unit[i] = 1.0
-                if problem.G is not None and i < n:
-                    unit[:n] = problem.G[t, b][:, i]
-                for later in range(t, L):
-                    answers[t, later] = unit[:n]
-                    if later + 1 < L:
-                        unit = A[later + 1, b] @ unit
-            D = answers.reshape(L, -1).T
-            parts.append(problem.q[i] * D @ D.T)
-        for i in range(n):
-            parts.insert(n + i, np.diag(np.tile(np.eye(n)[i] * problem.v[i], L)))
-        whole = whole + sum(parts)
-        residual = (problem.r[1:, b, :, 0] - drift).reshape(-1)
-        keep = np.ix_(there, there)
-        yield whole[keep], [part[keep] for part in parts], residual[there]
-
-
 @pytest.mark.parametrize("case", CASES[:3])
 def test_average_information_is_that_of_the_dense_covariance(case):
     problem = Problem(*case)
     found, _ = information(problem, noise_of(problem, case[2]))
-    expected = 0.0
-    for whole, parts, y in dense(problem):
+    expected, n = 0.0, problem.n
+    for b in range(B):
+        H, variances, kind, channel, y = problem.dense(b)
+        whole = (H * variances) @ H.T + np.diag(problem.v[channel])
+        parts = [(H * (variances * (kind == i))) @ H.T for i in range(problem.N)]
+        parts[n:n] = [np.diag(problem.v[i] * (channel == i)) for i in range(n)]
         weighed = np.linalg.solve(whole, y)
         answers = np.stack([part @ weighed for part in parts])
         expected = expected + 0.5 * answers @ np.linalg.solve(whole, answers.T)

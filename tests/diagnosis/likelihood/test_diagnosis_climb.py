@@ -10,11 +10,7 @@ from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.linearise import gains_of, linearise
-from grounded.diagnosis.likelihood.noise import (
-    Structure,
-    likelihood_slopes,
-    started,
-)
+from grounded.diagnosis.likelihood.noise import Structure, likelihood_slopes, started
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.likelihood.refine import refine
 from grounded.diagnosis.likelihood.step import bounded

@@ -1,4 +1,4 @@
-"""Effects that are one thing once a parameter may move: fitted to the end, named together."""
+"""Effects that are one thing, or that cancel: fitted to the end, named together, or refused."""
 
 import itertools
 from dataclasses import replace
@@ -7,13 +7,18 @@ import numpy as np
 import pytest
 
 from grounded import Model, Param, Trial
+from grounded.diagnosis.causes import meaning
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.hypotheses.lookalike import lookalikes, moving, twins
+from grounded.diagnosis.hypotheses.explored import FittedHypotheses
+from grounded.diagnosis.hypotheses.lookalike import lookalikes, moving, one_clock, twins
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.parts import Estimate
 from grounded.effects import Library
+from grounded.models.pendulum import model as pendulum
+from stepped import levels, library, logged, stepped
 
 DT = 0.05
 
@@ -33,19 +38,9 @@ def turner(tau=0.10, gain=1.0, **known):
 
 def trials(count=4, steps=150, gain=0.88):
     """Runs from rest of one that turns 12 % less, and takes 20 % longer."""
-    real, rng, found = turner(0.12, gain), np.random.default_rng(2), []
-    for _ in range(count):
-        c = np.repeat(rng.uniform(-1.2, 1.2, steps // 10), 10)
-        states = [np.zeros(2)]
-        for value in c:
-            states.append(
-                real.system.step(states[-1][None], np.array([[value]]), real.values, DT)[0]
-            )
-        y = np.array(states) + rng.normal(size=(len(states), 2)) * [1e-3, 4e-3]
-        found.append(
-            Trial(y, c[:, None], DT, real.state_names, real.input_names, start_inputs=np.zeros(1))
-        )
-    return found
+    real, rng = turner(0.12, gain), np.random.default_rng(2)
+    sent = [levels(rng, steps // 10, 10, 1.2) for _ in range(count)]
+    return [logged(real, stepped(real, u, DT), u, DT, [1e-3, 4e-3], rng) for u in sent]
 
 
 @pytest.mark.parametrize(
@@ -152,3 +147,79 @@ def test_an_input_that_acts_the_other_way_round_is_found_at_its_size():
     found = diagnose(turner(0.12), trials(2, gain=-1.0), DiagnosisOptions(library=library))
     assert found.effects == ("input_gain:c",)
     assert found.ranking[0].params["g"].value == pytest.approx(-2.0, abs=0.02)
+
+
+@pytest.fixture(scope="module")
+def turned():
+    model = turner(0.12, 0.88)
+    data = prepare(model, trials(1, 300))
+    return FittedHypotheses(data, Library().candidates(model, data.scales))
+
+
+LESS = {
+    "rate_gain:w": {"g": 0.498},
+    "input_gain:c": {"g": -0.317},
+    "viscous_friction:w": {"k": -3.9},
+}
+
+
+def of(known, values):
+    h, by_name = Hypothesis(), {effect.name: effect for effect in known.candidates}
+    for name, some in values.items():
+        h = h.plus(by_name[name], some)
+    return h
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        ({}, True),
+        ({"viscous_friction:w": {"k": 1.0}}, False),  # it adds to what the weaker input does
+        ({"rate_gain:w": {"g": 0.04}, "viscous_friction:w": {"k": -0.3}}, False),  # all weaker
+    ],
+)
+def test_three_effects_that_cancel_are_refused(turned, change, refused):
+    """Half as fast again, of a weaker input, with less friction: a 3 % shorter time constant."""
+    h = of(turned, LESS | change)
+    assert turned.cancelling(h) == refused
+    for name in LESS:  # two of them do something
+        assert not turned.cancelling(h.minus(name))
+
+
+@pytest.mark.parametrize("family", ["viscous_friction", "coulomb_friction", "quadratic_drag"])
+def test_less_friction_than_modelled_is_said_so(turned, family):
+    effect = {effect.name: effect for effect in turned.candidates}[f"{family}:w"]
+    name = effect.free[0].name
+    more, less = (meaning(effect, {name: Estimate(v, unit="1/s")}) for v in (3.9, -3.9))
+    assert "3.9 1/s" in more and "less" not in more
+    assert "3.9 1/s" in less and "less" in less and "-" not in less
+
+
+AXES = Model(
+    name="axes",
+    states={"x": "m", "y": "m", "vx": "m/s", "vy": "m/s"},
+    inputs={"F": "N", "G": "N"},
+    derivative=lambda s, a, p: {"x": s.vx, "y": s.vy, "vx": a.F - s.vx, "vy": 2 * a.G - s.vy},
+)
+
+
+@pytest.mark.parametrize("model", [pendulum, AXES])
+def test_a_delay_of_every_command_is_one_of_every_sensor(model):
+    effect = Library().effect(f"delay:{'+'.join(model.input_names)}", model)
+    (one,) = one_clock(model, [effect], model.state_names)
+    assert one[1] == f"sensor_delay:{'+'.join(model.state_names)}"
+
+
+@pytest.mark.slow
+def test_a_diagnosis_that_claims_the_one_says_the_other():
+    runs = []
+    for seed in range(2):  # a pendulum whose commands arrive two steps late
+        rng = np.random.default_rng(seed)
+        u = levels(rng, 40, 6)
+        x = stepped(pendulum, np.r_[np.zeros((2, 1)), u[:-2]], DT)
+        runs.append(logged(pendulum, x, u, DT, [2e-3, 1e-2], rng, id=f"t{seed:04}"))
+    few = library("delay", "input_gain", "viscous_friction")
+    found = diagnose(pendulum, runs, DiagnosisOptions(library=few))
+    assert found.effects == ("delay:torque",)
+    assert ("delay:torque", "sensor_delay:theta+omega") in found.equivalent
+    assert "gap.equivalent" in {one.code for one in found.findings}
