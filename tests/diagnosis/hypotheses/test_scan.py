@@ -12,7 +12,7 @@ from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
-from grounded.trial import Trial
+from stepped import logged
 
 
 def test_fits_start_from_every_local_maximum_of_the_scan():
@@ -25,6 +25,11 @@ def test_fits_start_from_every_local_maximum_of_the_scan():
 
 
 def test_a_late_position_is_tried_with_a_filter_of_its_own():
+    cart = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"u": "m/s^2"},
+        derivative=lambda s, a, p: {"x": s.v, "v": a.u},
+    )
     rng, trials = np.random.default_rng(3), []
     for _ in range(3):
         u = np.repeat(rng.uniform(-1, 1, 15), 10)
@@ -32,13 +37,7 @@ def test_a_late_position_is_tried_with_a_filter_of_its_own():
         x = np.concatenate([[0.0], np.cumsum(0.02 * v[:-1])])
         late = x - 0.05 * v + 0.01 * rng.standard_normal(151)
         states = np.column_stack([late, v + 0.01 * rng.standard_normal(151)])
-        trials.append(Trial(states, u[:, None], 0.02, ("x", "v"), ("u",)))
-    cart = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"u": "m/s^2"},
-        params={},
-        derivative=lambda s, a, p: {"x": s.v, "v": a.u},
-    )
+        trials.append(logged(cart, states, u, 0.02))
     data = prepare(cart, trials)
     search = HypothesisSearch(data, Library().candidates(cart, data.scales))
     null = search.nulls()
@@ -63,9 +62,8 @@ def test_a_state_that_is_set_outright_has_no_rate_to_be_scaled():
 
 def test_a_scan_of_a_few_runs_at_a_time_is_that_of_all_at_once(monkeypatch):
     rng, (B, T) = np.random.default_rng(2), (5, 60)
-    names = (car.state_names, car.input_names)
     trials = [
-        Trial(0.1 * rng.normal(size=(T + 1, car.n)), rng.normal(size=(T, car.m)), 0.05, *names)
+        logged(car, 0.1 * rng.normal(size=(T + 1, car.n)), rng.normal(size=(T, car.m)), 0.05)
         for _ in range(B)
     ]
     data = prepare(car, trials)
@@ -81,4 +79,3 @@ def test_a_scan_of_a_few_runs_at_a_time_is_that_of_all_at_once(monkeypatch):
         gains = np.array([[look.gain for look in looks] for looks in found])
         np.testing.assert_allclose(*gains, rtol=1e-6, atol=1e-6)
         assert (gains[0] > 0.1).sum() > 10
-    assert len(fits) == 2

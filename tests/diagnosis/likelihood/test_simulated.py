@@ -13,7 +13,7 @@ from grounded.diagnosis.likelihood.simulated import Slopes, simulated
 from grounded.diagnosis.validation.limits import limits
 from grounded.effects import Library
 from grounded.model import Model, Param
-from grounded.trial import Trial
+from stepped import logged
 
 
 def swinging(s, a, p, dt):
@@ -32,15 +32,10 @@ MODEL = Model(
 
 
 def data_of():
-    rng, x, u = (
-        np.random.default_rng(0),
-        np.cumsum(np.ones((61, 2)), axis=0) / 30,
-        np.zeros((60, 1)),
-    )
+    rng, x = np.random.default_rng(0), np.cumsum(np.ones((61, 2)), axis=0) / 30
     x[:, 1] = np.sin(x[:, 0])
-    names = MODEL.state_names, MODEL.input_names
-    runs = [Trial(x + 0.01 * rng.standard_normal(x.shape), u + k, 0.02, *names) for k in range(2)]
-    return prepare(MODEL, runs)
+    sent = [np.full(60, float(k)) for k in range(2)]
+    return prepare(MODEL, [logged(MODEL, x, u, 0.02, 0.01, rng) for u in sent])
 
 
 def test_columns_by_slopes_are_those_of_steps(monkeypatch):
@@ -105,15 +100,15 @@ def test_hypotheses_set_out_from_the_slopes_of_the_first():
 
 
 def test_of_a_long_log_the_stretches_that_move_most_are_asked():
-    names, T = (MODEL.state_names, MODEL.input_names), 3000
+    T = 3000
     x, u = np.zeros((T + 1, 2)), np.zeros((T, 1))
     u[2000:2400, 0] = np.sin(np.arange(400) / 5)
     x[2000:2401, 0] = np.cos(np.arange(401) / 50)
-    data = prepare(MODEL, [Trial(x, u, 0.02, *names)])
+    data = prepare(MODEL, [logged(MODEL, x, u, 0.02)])
     assert data.steps <= 1000 < T and data.skipped == 15 and len(data.valid) == 5
     begin = data.step_at[:, 0]
     assert begin[0] == 0 and ((begin >= 1800) & (begin < 2400)).any()  # where the trial begins, too
     (one,) = [one for one in limits(data).findings if one.code == "model.share"]
     assert (one.facts["used"], one.facts["total"]) == (5, 20)
-    short = prepare(MODEL, [Trial(x[:201], u[:200], 0.02, *names) for _ in range(2)])
+    short = prepare(MODEL, [logged(MODEL, x[:201], u[:200], 0.02) for _ in range(2)])
     assert short.skipped == 0 and short.steps == 400

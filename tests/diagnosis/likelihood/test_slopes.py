@@ -1,0 +1,233 @@
+"""Slopes of steps and of the likelihood by states, values and noise; the climb inside bounds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from grounded import Model, Trial
+from grounded.challenge.cases import make
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood import marching
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.joint_memory import remembering
+from grounded.diagnosis.likelihood.linearise import (
+    gains_of,
+    linearise,
+    sensitivities,
+    step_jacobian,
+)
+from grounded.diagnosis.likelihood.noise import Structure, likelihood_slopes, started
+from grounded.diagnosis.likelihood.predictor import Predictor
+from grounded.diagnosis.likelihood.refine import refine
+from grounded.diagnosis.likelihood.step import bounded
+from grounded.effects import Library, wrap
+from grounded.effects.plain_step import plain_step
+from grounded.filter.kalman import innovations, smoother
+from grounded.models.pendulum import model as pendulum
+from stepped import logged, slopes, stepped
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_bounded_step_is_the_best_one_inside(seed):
+    """With the unknowns that stopped held where they are, nothing else wants to move."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((12, 4))
+    G, slope = A.T @ A, 3 * rng.standard_normal(4)
+    low, high = -rng.uniform(0, 0.2, 4), rng.uniform(0, 0.2, 4)
+    low[3], high[3] = -np.inf, np.inf
+    step = bounded(G, slope, low, high)
+    assert (step >= low).all() and (step <= high).all()
+    inside = (step > low) & (step < high)
+    assert np.abs((G @ step + slope)[inside]).max(initial=0.0) < 1e-9
+    np.testing.assert_allclose(
+        bounded(G, slope, low - np.inf, high + np.inf), -np.linalg.solve(G, slope)
+    )
+
+
+@pytest.mark.parametrize("tau", [None, 0.1])
+def test_the_slopes_of_the_noise_are_those_of_the_likelihood(tau):
+    rng, trials = np.random.default_rng(2), []
+    for _ in range(12):
+        x = np.cumsum(0.1 * rng.standard_normal((13, 1)), axis=0)
+        y = x + 0.1 * rng.standard_normal((13, 1))
+        trials.append(Trial(y, np.zeros((12, 1)), 0.05, ("x",), ("u",)))
+    drift = Model(
+        states={"x": "m"}, inputs={"u": "m/s"}, params={}, derivative=lambda s, a, p: {"x": a.u}
+    )
+    data = prepare(drift, trials)
+    predictor, h, track = Predictor(data), Hypothesis(), data.y.copy()
+    start = HypothesisSearch(data, ()).fresh(h)[1].allowing(Structure(tau), data.dt)
+
+    def likelihood(noise):
+        return refine(predictor, [(h, noise, track)], iterations=1)[0].loglik
+
+    F, d, r = linearise(predictor, h, track)
+    g = gains_of(predictor, h, start, track, F)
+    white = innovations(g, d, r)[0][..., 0]
+    starts = started(g, white, start.structure.phi(data.dt))
+    slope = likelihood_slopes(start, smoother(g, white), data.dt, starts)
+    for row, name in zip(slope, ("log_q", "log_r", "log_c"), strict=False):
+        up, down = (replace(start, **{name: getattr(start, name) + e}) for e in (1e-4, -1e-4))
+        assert row[0] == pytest.approx((likelihood(up) - likelihood(down)) / 2e-4, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def cars():
+    case = next(iter(make("none", 1, 17, only="car")))
+    return case, prepare(case.model, case.trials, case.latency)
+
+
+def effect(data, name):
+    return Library().effect(name, data.model, data.scales)
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("coupling:psi<-v", {"k": 0.36}),
+        ("viscous_friction:v", {"k": 0.8}),
+        ("quadratic_drag:v", {"k": 0.5}),
+        ("understeer:psi", {"k": 0.2}),
+        ("rate_gain:v", {"g": 0.3}),
+        ("slope:v", {"a": 0.2, "b": -0.3}),
+        ("slew_limit:delta", {"r": 0.5}),
+        ("grip_limit:psi", {"a": 1.0}),
+    ],
+)
+def test_the_jacobian_is_that_of_the_hypothesis(cars, name, values):
+    _, data = cars
+    predictor, h = Predictor(data), Hypothesis().plus(effect(data, name), values)
+    track = data.y.copy()
+    track[..., data.model.state_names.index("v")] += 0.5  # away from the kink at rest
+    u = predictor.inputs(h)
+    found = slopes(lambda x: predictor.advance(h, x, u, data.time), track[:-1])
+    error = np.abs(step_jacobian(predictor, h, track) - found).max(axis=-2)
+    most = np.abs(found).max(axis=(0, 1, 2))
+    # kinks (braking, a limit that is just reached) lie on few of the steps
+    assert (np.quantile(error, 0.9, axis=(0, 1)) < 0.02 * np.maximum(1.0, most)).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("viscous_friction:v", {"k": 2.0}), ("rate_gain:v", {"g": 0.3})]
+)
+def test_parameters_act_through_the_effects(cars, name, values):
+    _, data = cars
+    predictor = Predictor(data)
+    h = replace(Hypothesis().plus(effect(data, name), values), spread=1.0)
+    x, u, t = data.y[:-1], predictor.inputs(h), data.time
+    d, size = linearise(predictor, h, data.y, whole=True)[1], 1e-6
+    free = [p for p in data.model.params.values() if p.spread > 0]
+    assert d.shape[-1] == 1 + len(values) + len(free)
+    for i, param in enumerate(data.model.params.values()):
+        shift = size * param.spread * np.eye(len(data.model.params))[i]
+        up, down = (predictor.advance(replace(h, shift=s), x, u, t) for s in (shift, -shift))
+        slope = data.model.difference(up, down) / (2 * size)
+        got = d[..., 1 + len(values) + i]
+        error = np.quantile(np.abs(got - slope).max(axis=-1), 0.9)
+        assert error <= 1e-3 * np.abs(slope).max()
+
+
+@pytest.mark.slow
+def test_a_carried_heading_rate_is_limited_with_the_heading(cars):
+    """A gyro shows what the tyres let the heading do; adopted, the model says the same."""
+    _, data = cars
+    predictor, grip = Predictor(data), effect(data, "grip_limit:psi")
+    h, names = Hypothesis().plus(grip, {"a": 1.0}), data.model.state_names
+    speed, rate = names.index("v"), names.index("psi_rate")
+    x, u = data.y[:-1].copy(), predictor.inputs(h)
+
+    def limited(at):
+        own = predictor.instant(Hypothesis(), at, u)[..., names.index("psi")]
+        most = 1.0 / np.maximum(np.abs(at[..., speed]), 1e-3)
+        return np.clip(own, -most, most), np.abs(own) > 1.2 * most
+
+    x[..., rate] = limited(x)[0]
+    after = predictor.advance(h, x, u, data.time)
+    expected, sliding = limited(after)
+    assert sliding.mean() > 0.05
+    np.testing.assert_allclose(after[..., rate], expected, atol=1e-9)
+    model = wrap(grip, {"a": 1.0}, data.dt)
+    adopted = model.system.step(*predictor.flat(x, u), model.values, data.dt).reshape(x.shape)
+    np.testing.assert_allclose(adopted, after, atol=1e-4)
+
+
+def test_a_threshold_of_the_model_has_a_slope(cars):
+    case, data = cars
+    model = case.model
+    x = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.0], (9, 1))
+    u = np.column_stack([np.zeros(9), np.linspace(0.16, 0.2, 9)])  # around the stall
+    _, _, f_p = sensitivities(model, x, u, model.values, data.dt)
+    exact = model.system.sensitivities(x, u, model.values, data.dt)[2]
+    stall = model.param_names.index("stall")
+    assert not exact[..., stall].any()
+    assert f_p[:, model.state_names.index("v"), stall].min() < 0
+    others = [i for i in range(len(model.param_names)) if i != stall and exact[..., i].any()]
+    np.testing.assert_array_equal(f_p[..., others], exact[..., others])
+    drag = Hypothesis().plus(effect(data, "viscous_friction:v"), {"k": 0.1})
+    near = replace(data, commands=np.full_like(data.commands, 0.182))
+    track = np.tile(x[0], (*data.y.shape[:2], 1))
+    d = linearise(Predictor(near), replace(drag, spread=1.0), track, whole=True)[1]
+    assert d[..., 2 + stall].any()  # also beside effects
+
+
+STEPS = 60
+
+
+def data_of(model):
+    rng, trials = np.random.default_rng(1), []
+    for _ in range(3):
+        u = 0.3 * rng.standard_normal((STEPS, model.m))
+        x = stepped(model, u, 0.05, 0.3 * np.ones(model.n))
+        trials.append(logged(model, x, u, 0.05, 1e-3, rng))
+    return prepare(model, trials)
+
+
+def valued(effect, part):
+    """Some value of each free quantity."""
+    found = {}
+    for q in effect.free:
+        low, high = max(q.low, -0.2), min(q.high, 0.4)
+        found[q.name] = float(np.quantile(q.grid, part)) if q.grid else low + part * (high - low)
+    return found
+
+
+def turned(model):
+    """The model as a step that returns its states in another order."""
+    step = plain_step(model)
+
+    def backwards(s, a, p, dt):
+        return dict(reversed(step(s, a, p, dt).items()))
+
+    return replace(model, derivative=None, step=backwards)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("before", ["", "delay", "first_order_lag"])
+@pytest.mark.parametrize("model", [pendulum, turned(pendulum)], ids=["derivative", "step"])
+def test_a_compiled_hypothesis_goes_where_its_steps_lead(model, before, monkeypatch):
+    monkeypatch.setattr(marching, "STEPS_TO_COMPILE", 1)
+    data = data_of(model)
+    predictor, compiled, refused = Predictor(data), set(), set()
+    by_family = {e.family.name: e for e in Library().candidates(model, data.scales)}
+    for effect in by_family.values():
+        h = Hypothesis().plus(effect, valued(effect, 0.5))
+        if not (h.rates or h.losses):
+            continue
+        if remembering(h):  # what a joint remembers follows from motion, whatever else acts on it
+            h = h.plus(by_family["viscous_friction"], {"k": 0.4})
+        if before:  # inputs that change within a step
+            late = by_family[before]
+            h = h.plus(late, {late.quantities[0].name: 0.4 * data.dt})
+        sent = predictor.received(h, leads=True)
+        x, u = predictor.widened(h, data.y[:-1])[0], sent[:, : len(data.y)].transpose(1, 0, 2)
+        path = [x]
+        with np.errstate(all="ignore"):
+            for k, now in enumerate(u):
+                path.append(predictor.advance(h, path[-1], now, np.full(len(x), k * data.dt)))
+            found = marching.marched(predictor, h, x, u)
+        (refused if found is None else compiled).add(effect.family.name)
+        if found is not None:
+            np.testing.assert_allclose(found, path, 1e-9, 1e-12, err_msg=effect.name)
+    assert len(compiled) > 3 and {"periodic", "elastic_joint", "dahl_friction"} <= compiled
