@@ -15,7 +15,8 @@ takes 40 ms.
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from mmap import ACCESS_READ, mmap
 from struct import Struct
 from typing import Any, BinaryIO
@@ -39,6 +40,7 @@ from grounded_trials.formats.mcap_records import (
     Fields,
     Messages,
     Record,
+    Rows,
     Schema,
     batch,
     chunk_content,
@@ -209,6 +211,61 @@ class _Walk:
         self.pos += 8
         if self.pos != self.size:
             raise self.damaged("record", "its end", f"{self.size - self.pos} bytes more")
+
+
+@dataclass(frozen=True, eq=False)
+class Topic:
+    """A topic of a file: its channel, and the type of its messages."""
+
+    channel: Channel
+    schema: Schema | None
+
+    @property
+    def name(self) -> str:
+        """Its name."""
+        return self.channel.topic
+
+    @property
+    def type(self) -> str:
+        """The name of its messages' type, else their encoding."""
+        return self.schema.name if self.schema else self.channel.encoding
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Messages, or rows of a table, of one topic."""
+
+    topic: Topic
+    content: Messages | Rows
+
+
+def by_topic(records: Iterable[Record], name: str) -> Iterator[Record | Topic | Part]:
+    """Yield records with topics in place of schemas and channels, and messages with theirs.
+
+    Args:
+        records: of one file.
+        name: of the file, for messages.
+
+    Raises:
+        DamagedFile: for messages whose channel is not defined.
+    """
+    schemas, topics = dict[int, Schema](), dict[int, Topic]()
+    for record in records:
+        if isinstance(record, Schema):
+            schemas[record.id] = record
+        elif isinstance(record, Channel):
+            if record.id not in topics:
+                topics[record.id] = Topic(record, schemas.get(record.schema_id))
+                yield topics[record.id]
+        elif isinstance(record, Rows):
+            yield Part(topics[record.channel], record)
+        elif isinstance(record, Messages):
+            for identity in record.channel_ids():
+                if identity not in topics:
+                    raise DamagedFile(name, 0, "record", "a message", f"channel {identity}")
+                yield Part(topics[identity], record.of(identity))
+        else:
+            yield record
 
 
 def again(known: Schema | Channel, other: Schema | Channel) -> BadRecord:

@@ -49,7 +49,6 @@ class Decoded:
 class Decoder:
     """Decodes a topic's messages."""
 
-    topic: str
     name: str  # of the message type
     decode: Callable[[bytes], Any] = field(repr=False)
 
@@ -103,14 +102,14 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
     """
     encoding, name = channel.encoding, schema.name if schema else ""
     if encoding in ("json", "table"):
-        return Decoder(channel.topic, name or encoding, json.loads)
+        return Decoder(name or encoding, json.loads)
     if encoding not in ("cdr", "ros1", "protobuf"):
         raise BadSchema("decode", what="encoding", at=encoding)
     if schema is None:
         raise BadSchema("decode", what="schema", at=encoding)
     if encoding == "protobuf":
-        return Decoder(channel.topic, name, message_class(schema.data, name).FromString)
-    return Decoder(channel.topic, name, _ros(schema, encoding))
+        return Decoder(name, message_class(schema.data, name).FromString)
+    return Decoder(name, _ros(schema, encoding))
 
 
 # What the objects are

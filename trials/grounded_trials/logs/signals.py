@@ -19,7 +19,8 @@ from grounded.checks import near, refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.formats.bad import Bad, BadMessage, BadPath, BadSchema
-from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema
+from grounded_trials.formats.mcap_records import Rows
+from grounded_trials.formats.mcap_walk import Part, Topic, by_topic
 from grounded_trials.formats.message_path import MessagePath, parse_path
 from grounded_trials.formats.messages import Decoded, Decoder, Floats, Ints, decoder_of
 from grounded_trials.formats.path_walk import evaluate
@@ -91,103 +92,56 @@ def read_signals(
 def _read_signals(
     files: tuple[Path, ...], specs: Mapping[str, SignalSpec], layout: Layout
 ) -> dict[str, Series]:
-    collectors = {name: _Collector(name, spec) for name, spec in specs.items()}
+    collectors = [_Collector(name, spec) for name, spec in specs.items()]
+    topics, decoders = set[str](), dict[Topic, Decoder]()
     for path in files:
-        log = _Log(str(path), list(collectors.values()))
-        for record in log_records(path, layout):
-            if isinstance(record, Schema):
-                log.schemas[record.id] = record
-            elif isinstance(record, Channel):
-                log.channel(record)
-            elif isinstance(record, Messages | Rows):
-                log.messages(record)
-        for collector in collectors.values():
-            collector.topics |= set(log.topics)
-    _refuse_missing(collectors, str(files[0]))
-    return {name: collector.series() for name, collector in collectors.items()}
+        for one in by_topic(log_records(path, layout), str(path)):
+            if isinstance(one, Part) and one.topic in decoders:
+                _collect(decoders[one.topic], _wanting(collectors, one.topic), one, str(path))
+            elif isinstance(one, Topic):
+                topics.add(one.name)
+                wanting = _wanting(collectors, one)
+                try:
+                    decoders |= {one: decoder_of(one.channel, one.schema)} if wanting else {}
+                except BadSchema as error:
+                    raise wanting[0].misfit(one, str(path), error) from None
+                for collector in wanting:
+                    collector.type = one.type
+    _refuse_missing([one for one in collectors if not one.type], sorted(topics), str(files[0]))
+    return {collector.name: collector.series() for collector in collectors}
 
 
-def _refuse_missing(collectors: Mapping[str, _Collector], file: str) -> None:
+def _wanting(collectors: Sequence[_Collector], topic: Topic) -> list[_Collector]:
+    return [one for one in collectors if one.path.topic == topic.name]
+
+
+def _collect(decoder: Decoder, wanting: Sequence[_Collector], part: Part, file: str) -> None:
+    """Pass the messages of a topic to those who want its numbers."""
+    collector, seen, content = wanting[0], 0, part.content
+    try:
+        for some in decoder.parts(content):
+            for collector in wanting:
+                collector.collect(some)
+            seen += len(some.log_times)
+    except BadMessage as error:
+        times = content.times if isinstance(content, Rows) else content.log_times
+        at = float(times[seen + error.message]) * 1e-9
+        raise collector.misfit(part.topic, file, error, at) from None
+    except BadPath as error:
+        raise collector.misfit(part.topic, file, error) from None
+
+
+def _refuse_missing(missing: Sequence[_Collector], known: Sequence[str], file: str) -> None:
     """Name all signals of the first topic that the log does not have."""
-    missing = {name: one for name, one in collectors.items() if not one.type}
     if not missing:
         return
-    first = next(iter(missing.values()))
-    topic, known = first.path.topic, sorted(first.topics)
-    names = tuple(name for name, one in missing.items() if one.path.topic == topic)
+    topic = missing[0].path.topic
+    names = ", ".join(one.name for one in missing if one.path.topic == topic)
     few = 0 < len(known) <= TOPICS_NAMED  # the nearest name may be another's: /left for /port
     others = {"known": tuple(known)} if few else near(topic, known)
     then = NextCommand("inspect", (file,))
-    facts: dict[str, Any] = {"kind": "topic", "of": Path(file).name, "where": ", ".join(names)}
+    facts: dict[str, Any] = {"kind": "topic", "of": Path(file).name, "where": names}
     raise refused("given.name", topic, **facts, then=then, **others)
-
-
-class _Log:
-    """One file while it is read: its schemas, and which channel feeds which signals."""
-
-    def __init__(self, name: str, collectors: list[_Collector]) -> None:
-        self.name, self.collectors = name, collectors
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, Channel] = {}
-        self.topics: dict[str, str] = {}
-        self.wanted: dict[int, tuple[Decoder, list[_Collector]]] = {}
-
-    def channel(self, channel: Channel) -> None:
-        if channel.id in self.channels:
-            return
-        self.channels[channel.id] = channel
-        schema = self.schemas.get(channel.schema_id)
-        self.topics[channel.topic] = name = schema.name if schema else channel.encoding
-        wanting = [c for c in self.collectors if c.path.topic == channel.topic]
-        if wanting:
-            try:
-                self.wanted[channel.id] = (decoder_of(channel, schema), wanting)
-            except BadSchema as error:
-                raise self._misfit(channel, wanting[0], error) from None
-        for collector in wanting:
-            collector.type = name
-
-    def messages(self, batch: Messages | Rows) -> None:
-        """Collect the samples in messages, or in the rows of a table."""
-        present = [batch.channel] if isinstance(batch, Rows) else batch.channel_ids()
-        unknown = [c for c in present if c not in self.channels]
-        if unknown:
-            then = NextCommand("recover", (self.name,))
-            raise GroundedError(
-                found("file.damaged", self.name, part=f"channel {unknown[0]}", then=then)
-            )
-        for identity, (decoder, wanting) in self.wanted.items():
-            if identity in present:
-                own = batch if isinstance(batch, Rows) else batch.of(identity)
-                self._collect(decoder, wanting, own, self.channels[identity])
-
-    def _collect(
-        self, decoder: Decoder, wanting: list[_Collector], own: Messages | Rows, channel: Channel
-    ) -> None:
-        collector, seen = wanting[0], 0
-        try:
-            for part in decoder.parts(own):
-                for collector in wanting:
-                    collector.collect(part)
-                seen += len(part.log_times)
-        except BadMessage as error:
-            times = own.times if isinstance(own, Rows) else own.log_times
-            at = float(times[seen + error.message]) * 1e-9
-            raise self._misfit(channel, collector, error, at) from None
-        except BadPath as error:
-            raise self._misfit(channel, collector, error) from None
-
-    def _misfit(
-        self, channel: Channel, collector: _Collector, error: Bad, at: float | None = None
-    ) -> GroundedError:
-        facts: dict[str, Any] = {
-            "topic": channel.topic,
-            "type": self.topics[channel.topic],
-            "why": error.finding.what,
-            "at": at,
-        }
-        facts |= {"file": self.name, "path": collector.path.text}
-        return GroundedError(found("file.signal", collector.name, **facts))
 
 
 class _Collector:
@@ -199,7 +153,12 @@ class _Collector:
         self.parts: list[tuple[Ints, Floats, Ints]] = []
         self.messages = 0
         self.type = ""
-        self.topics: set[str] = set()
+
+    def misfit(self, topic: Topic, file: str, error: Bad, at: float | None = None) -> GroundedError:
+        """Return the error for a topic that can't be read, or has no such number."""
+        facts: dict[str, Any] = {"topic": topic.name, "type": topic.type, "at": at}
+        facts |= {"why": error.finding.what, "file": file, "path": self.path.text}
+        return GroundedError(found("file.signal", self.name, **facts))
 
     def collect(self, part: Decoded) -> None:
         self.messages += len(part.log_times)

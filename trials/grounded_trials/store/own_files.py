@@ -24,14 +24,20 @@ from grounded_trials.formats.bad import BadSchema
 from grounded_trials.formats.mcap_records import (
     MAGIC,
     Attachment,
-    Channel,
     End,
     Messages,
     Metadata,
     Record,
     Schema,
 )
-from grounded_trials.formats.mcap_walk import DamagedFile, mapped, read_records
+from grounded_trials.formats.mcap_walk import (
+    DamagedFile,
+    Part,
+    Topic,
+    by_topic,
+    mapped,
+    read_records,
+)
 from grounded_trials.formats.protobuf import double_tag, doubles_tag, numbers_in, uniform_doubles
 from grounded_trials.plain_file import open_file, read_file, unreadable
 
@@ -207,36 +213,30 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         name, source = str(source), read_file(Path(source), FILE_LIMIT)
     meta: dict[str, str] | None = None
     attachments: dict[str, bytes] = {}
-    schemas: dict[int, Schema] = {}
-    channels: dict[int, Channel] = {}
+    topics: list[Topic] = []
     messages: dict[str, list[Messages]] = {}
-    for record in read_records(source, name, packed=False):
+    for record in by_topic(read_records(source, name, packed=False), name):
         if isinstance(record, Metadata) and record.name == "grounded":
             meta = record.data
         elif isinstance(record, Attachment):
             attachments[record.name] = record.data
-        elif isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, Channel):
-            channels[record.id] = record
-        elif isinstance(record, Messages):
-            for identity in record.channel_ids():
-                if identity not in channels:
-                    raise DamagedFile(name, 0, "record", "a message", f"channel {identity}")
-                messages.setdefault(channels[identity].topic, []).append(record.of(identity))
+        elif isinstance(record, Topic):
+            topics.append(record)
+        elif isinstance(record, Part) and isinstance(record.content, Messages):
+            messages.setdefault(record.topic.name, []).append(record.content)
         elif isinstance(record, End) and not record.data_crc and meta is not None:
             raise DamagedFile(name, len(source), "record", "its end", "no checksum")
     if meta is None or meta.get("format") != kind:
         has = str(meta and meta.get("format"))
         raise unreadable(name, f"format {has}", kind=f"{kind} file")
-    types = {c.topic: _type(c, schemas, name) for c in channels.values()}
+    types = {topic.name: _type(topic, name) for topic in topics}
     return OwnFile(name, source, meta, attachments, types, messages)
 
 
-def _type(channel: Channel, schemas: dict[int, Schema], name: str) -> Schema:
-    schema = schemas.get(channel.schema_id)
-    if channel.encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
-        raise unreadable(f"{name}: {channel.topic}", channel.encoding)
+def _type(topic: Topic, name: str) -> Schema:
+    schema, encoding = topic.schema, topic.channel.encoding
+    if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
+        raise unreadable(f"{name}: {topic.name}", encoding)
     return schema
 
 

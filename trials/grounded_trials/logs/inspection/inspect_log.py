@@ -16,15 +16,8 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded_trials.formats.bad import Bad, BadPath
-from grounded_trials.formats.mcap_records import (
-    Channel,
-    Header,
-    Messages,
-    Metadata,
-    Rows,
-    Schema,
-)
-from grounded_trials.formats.mcap_walk import DamagedFile
+from grounded_trials.formats.mcap_records import Header, Messages, Metadata, Rows
+from grounded_trials.formats.mcap_walk import DamagedFile, Part, Topic, by_topic
 from grounded_trials.formats.message_path import WORLD, MessagePath, is_topic, parse_path
 from grounded_trials.formats.messages import (
     Decoded,
@@ -175,73 +168,39 @@ def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT
 
 
 def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
-    look = _Look()
+    library: str | None = None
+    topics, meta = dict[str, _Topic](), dict[str, str]()
+    damage: Finding | None = None
     for path in files:
-        look.new_file()
         try:
-            for record in log_records(path, layout):
-                look.add(record)
+            for one in by_topic(log_records(path, layout), str(path)):
+                if isinstance(one, Header):
+                    library = one.library if library is None else library
+                elif isinstance(one, Topic):  # it goes on from file to file
+                    topics.setdefault(one.name, _Topic(one))
+                elif isinstance(one, Part):
+                    topics[one.topic.name].add(one.content)
+                elif isinstance(one, Metadata) and one.name == "grounded":
+                    meta = one.data
         except DamagedFile as error:
-            if not look.headers:
+            if library is None:
                 raise
-            look.damage = error.finding
+            damage = error.finding
             break
-    return look.report(files)
-
-
-class _Look:
-    """The summary while it is built; topics continue from file to file, channels do not."""
-
-    def __init__(self) -> None:
-        self.headers: list[Header] = []
-        self.topics: dict[str, _Topic] = {}
-        self.damage: Finding | None = None
-        self.meta: dict[str, str] = {}
-        self.new_file()
-
-    def new_file(self) -> None:
-        self.schemas: dict[int, Schema] = {}
-        self.channels: dict[int, _Topic] = {}
-
-    def add(self, record: object) -> None:
-        if isinstance(record, Header):
-            self.headers.append(record)
-        elif isinstance(record, Schema):
-            self.schemas[record.id] = record
-        elif isinstance(record, Channel):
-            known = self.topics.get(record.topic)
-            if known is None:
-                known = _Topic(record, self.schemas.get(record.schema_id))
-                self.topics[record.topic] = known
-            self.channels[record.id] = known
-        elif isinstance(record, Metadata) and record.name == "grounded":
-            self.meta = record.data
-        elif isinstance(record, Rows):
-            self.channels[record.channel].add(record)
-        elif isinstance(record, Messages):
-            for identity in record.channel_ids():
-                if identity in self.channels:
-                    self.channels[identity].add(record.of(identity))
-
-    def report(self, files: tuple[Path, ...]) -> LogReport:
-        times = [t for topic in self.topics.values() for t in topic.log_times]
-        joined = np.concatenate(times) if times else np.zeros(1, dtype=np.int64)
-        start, end = int(joined.min()), int(joined.max())
-        return LogReport(
-            files=files,
-            library=self.headers[0].library if self.headers else "",
-            start_ns=start,
-            duration_s=(end - start) * 1e-9,
-            messages=sum(topic.count for topic in self.topics.values()),
-            topics=tuple(topic.report(start) for topic in self.topics.values()),
-            damage=self.damage,
-            meta=self.meta if len(files) == 1 else {},
-            joints={
-                name: next(iter(topic.joints))
-                for name, topic in self.topics.items()
-                if len(topic.joints) == 1
-            },
-        )
+    times = [t for topic in topics.values() for t in topic.log_times]
+    joined = np.concatenate(times) if times else np.zeros(1, dtype=np.int64)
+    start, end = int(joined.min()), int(joined.max())
+    return LogReport(
+        files=files,
+        library=library or "",
+        start_ns=start,
+        duration_s=(end - start) * 1e-9,
+        messages=sum(topic.count for topic in topics.values()),
+        topics=tuple(topic.report(start) for topic in topics.values()),
+        damage=damage,
+        meta=meta if len(files) == 1 else {},
+        joints={n: next(iter(t.joints)) for n, t in topics.items() if len(t.joints) == 1},
+    )
 
 
 @dataclass
@@ -272,8 +231,7 @@ class _Range:
 class _Topic:
     """One topic so far."""
 
-    channel: Channel
-    schema: Schema | None
+    of: Topic
     count: int = 0
     looked: int = 0
     problem: str = ""
@@ -297,7 +255,7 @@ class _Topic:
             batch = batch.take(chosen)
         try:
             if self.decoder is None:
-                self.decoder = decoder_of(self.channel, self.schema)
+                self.decoder = decoder_of(self.of.channel, self.of.schema)
             for part in self.decoder.parts(batch):
                 self._look(self.decoder, part)
         except Bad as error:
@@ -317,7 +275,7 @@ class _Topic:
                 self.skews.append(values.stamps - part.log_times[values.rows])
 
     def _find_paths(self, part: Decoded) -> None:
-        topic = self.channel.topic if is_topic(self.channel.topic) else f'"{self.channel.topic}"'
+        topic = self.of.name if is_topic(self.of.name) else f'"{self.of.name}"'
         for rest in dict.fromkeys(rest for one in part.samples for rest in number_paths(one)):
             with suppress(GroundedError):  # a name that no path can contain
                 path = parse_path(topic + rest)
@@ -330,9 +288,9 @@ class _Topic:
         median = float(np.median(gaps)) if len(gaps) else 0.0
         skews = np.concatenate(self.skews) if self.skews else None
         return TopicReport(
-            topic=self.channel.topic,
-            type=self.schema.name if self.schema else "",
-            encoding=self.channel.encoding,
+            topic=self.of.name,
+            type=self.of.schema.name if self.of.schema else "",
+            encoding=self.of.channel.encoding,
             messages=self.count,
             rate_hz=1 / median if median > 0 else 0.0,
             jitter_s=float(high - low) / 2,
