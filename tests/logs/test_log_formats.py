@@ -15,7 +15,6 @@ from facts import holding
 from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.formats.tables import npz_tables
-from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
@@ -189,17 +188,17 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
     path.write_text("Time [ms],x\n0,1.5\n20,2.5\n4")
     found = read_signals(path, {"x": SignalSpec("/csv.x")})["x"]
     assert found.values.tolist() == [1.5, 2.5] and found.t.tolist() == [0, 20_000_000]
-    (cut,) = about_table(path).findings
-    assert cut.facts["text"] == "4" and inspect_log(path).findings[0].code == cut.code
+    (cut,) = inspect_log(path).about[0].findings
+    assert cut.facts["text"] == "4" and cut.code == "file.cut"
     for whole in ("t,x\n0,1.5\n20,2.5", "t,x\n0,1.5\n20,2.5\n", "t,x\n0,1.5\n\n\n"):
         path.write_text(whole)
-        assert not about_table(path).findings
+        assert not inspect_log(path).about[0].findings
     rows = [f"{0.1 * k:.2f},{k}.25,{k}.125" for k in range(30)]
     # half a number, a row that is too short, the zero bytes of a power loss
     for tail in ("2.90,29.2", "2.90,29.25\n", "2.90,29.25,-", "2.90,29.\0\0\0\0"):
         path.write_text("\n".join(["t,x,v", *rows[:29], tail]))
-        seen = read_signals(path, {"v": SignalSpec("/csv.v")})["v"].values
-        assert seen.tolist() == [k + 0.125 for k in range(29)] and about_table(path).findings, tail
+        seen = read_signals(path, {"v": SignalSpec("/csv.v")})["v"]
+        assert seen.values.tolist() == [k + 0.125 for k in range(29)] and seen.findings, tail
     path.write_text("\n".join(["t,x,v", *rows[:9], "0.90,9.25", *rows[10:]]) + "\n")
     with pytest.raises(GroundedError):  # not at the end: something else went wrong
         read_signals(path, {"v": SignalSpec("/csv.v")})

@@ -20,8 +20,9 @@ from typing import Any
 
 import numpy as np
 
+from grounded_trials.formats.mcap_records import About
 from grounded_trials.formats.messages import Floats
-from grounded_trials.formats.tables import AS_IT_SAYS, Layout, Tables, column_name
+from grounded_trials.formats.tables import AS_IT_SAYS, Described, Layout, Tables, column_name
 
 BEGINS = b"\xa3\x95\x80"  # a log's first message is an FMT
 HEAD, FMT, FMT_LENGTH = BEGINS[:2], 0x80, 89
@@ -56,24 +57,20 @@ class _Type:
 
 
 def dataflash_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
-    """Return the messages of a log that have numbers and a time."""
-    data = path.read_bytes()
-    instances = (one for kind in _types(data) for one in _instances(kind, _rows(data, kind)))
-    return {topic: columns for kind, topic, rows in instances if (columns := _numbers(kind, rows))}
-
-
-def dataflash_units(path: Path) -> dict[str, str]:
-    """Return the units that a log states, by message path."""
+    """Return the messages of a log that have numbers and a time, and the units that it states."""
     data = path.read_bytes()
     types = _types(data)
     labels = {str(unit): text for unit, text in _texts(data, types, "UNIT", "Id", "Label")}
-    return {
-        f"{topic}.{column_name(column)}": SPELLED.get(labels[letter], labels[letter])
-        for kind in types
-        for _, topic, _ in _instances(kind, _rows(data, kind))
-        for column, letter in zip(kind.columns, kind.units, strict=False)
-        if labels.get(letter)
-    }
+    tables, units = Described(), dict[str, str]()
+    for one in types:
+        for kind, topic, rows in _instances(one, _rows(data, one)):
+            if columns := _numbers(kind, rows):
+                tables[topic] = columns
+            for column, letter in zip(kind.columns, kind.units, strict=False):
+                if label := labels.get(letter):
+                    units[f"{topic}.{column_name(column)}"] = SPELLED.get(label, label)
+    tables.about = About(units)
+    return tables
 
 
 def _types(data: bytes) -> list[_Type]:

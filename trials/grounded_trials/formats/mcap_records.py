@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.findings import Finding
 from grounded_trials.formats.bad import BadRecord
 
 MAGIC = b"\x89MCAP0\r\n"  # at the beginning and the end of a file
@@ -99,6 +100,15 @@ class Rows:
 
 
 @dataclass(frozen=True)
+class About:
+    """What a file says of its tables, and what is odd about them."""
+
+    units: Mapping[str, str] = field(default_factory=dict)  # of its numbers, by message path
+    timed: bool = False  # its times are in seconds (`time_s`, `time [s]`), or times of day
+    findings: tuple[Finding, ...] = ()
+
+
+@dataclass(frozen=True)
 class Attachment:
     """A named file inside the file."""
 
@@ -124,7 +134,7 @@ class End:
     data_crc: bool
 
 
-Record = Header | Schema | Channel | Messages | Rows | Attachment | Metadata | End
+Record = Header | Schema | Channel | Messages | Rows | About | Attachment | Metadata | End
 
 
 def record_name(opcode: int) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import found
-from grounded_trials.formats.mcap_records import Channel, End, Header, Record, Rows, Schema
+from grounded_trials.formats.mcap_records import About, Channel, End, Header, Record, Rows, Schema
 from grounded_trials.formats.messages import Floats
 
 C = TypeVar("C")
@@ -44,6 +44,12 @@ LATEST = 4e18  # [ns], the year 2096
 
 Columns = Mapping[str, Floats]
 Tables = dict[str, Columns]  # by topic
+
+
+class Described(Tables):
+    """Tables of a file that says more of them."""
+
+    about = About()
 
 
 @dataclass(frozen=True)
@@ -165,6 +171,8 @@ def table_records(
     if not tables:
         raise GroundedError(found("file.no_times", str(path)))
     yield Header("", kind)
+    if isinstance(tables, Described):
+        yield tables.about
     made = []
     for i, (topic, columns) in enumerate(tables.items()):
         name, stamps = _at(columns, rate) if rate else _times(columns, path)

@@ -13,7 +13,7 @@ import codecs
 import csv
 import re
 from array import array
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -22,9 +22,11 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.findings import found
+from grounded_trials.formats.mcap_records import About
 from grounded_trials.formats.tables import (
     AS_IT_SAYS,
+    Described,
     Layout,
     Tables,
     column_name,
@@ -32,12 +34,10 @@ from grounded_trials.formats.tables import (
     is_time,
     time_among,
 )
-from grounded_trials.within import within
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # bytes and characters that show the encoding and the separator
-NAMELESS = ("file.no_times",)  # which [log] says then
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
 SECONDS = re.compile(r"(^|[\W_])s(ec|ecs|econds)?[\])]?$")  # at the end of a column's name
@@ -53,15 +53,6 @@ class _Head:
     mark: str  # separator of columns
     line: int  # line number of the names, from 1
     rows: int  # number of lines before the first row
-
-
-@dataclass(frozen=True)
-class AboutTable:
-    """What the head of a text table says, and what is odd about its rows."""
-
-    units: Mapping[str, str]  # in column names, `x [m]` or `x (m)`, by message path
-    in_time_units: bool  # its times are in seconds (`time_s`, `time [s]`), or times of day
-    findings: tuple[Finding, ...]  # an incomplete last row
 
 
 def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
@@ -89,23 +80,14 @@ def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
         raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
     values = np.array(numbers).reshape(-1, width)
     columns: dict[str, Any] = columns_by_name(zip(head.names, values.T, strict=True), path)
-    return {"/csv": columns | ({time: _stamps(texts, time, path)} if texts else {})}
+    columns |= {time: _stamps(texts, time, path)} if texts else {}
+    tables = Described({"/csv": columns})
+    tables.about = _about(head, lines, time, path)
+    return tables
 
 
-def about_table(path: Path) -> AboutTable:
-    """Return what a text table that names its columns says of itself; nothing for another file."""
-    try:
-        if path.suffix.lower() in SUFFIXES:
-            return within(path, path.stat().st_size, _about, path)
-    except GroundedError as error:
-        if error.finding is None or error.finding.code not in NAMELESS:
-            raise
-    return AboutTable({}, False, ())
-
-
-def _about(path: Path) -> AboutTable:
-    lines = _lines(path)
-    head = _head(lines, path)
+def _about(head: _Head, lines: Sequence[str], time: str, path: Path) -> About:
+    """Return the units in the column names, `x [m]` or `x (m)`, and an incomplete last row."""
     said = {
         name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
         for name, cell in zip(head.names, head.cells, strict=True)
@@ -114,9 +96,9 @@ def _about(path: Path) -> AboutTable:
     cut = _cut(lines, head)
     odd = [found("file.cut", str(path), line=str(cut[0]), text=cut[1][:80])] if cut else []
     row = next((cells for _, cells in _rows(lines[: head.rows + PREAMBLE], head)), [])
-    at = head.names.index(time) if (time := _time_in(head)) else len(head.names)
+    at = head.names.index(time) if time else len(head.names)
     named = any(SECONDS.search(cell.lower()) for cell in head.cells[at : at + 1])
-    return AboutTable(units, named or ":" in "".join(row[at : at + 1]), tuple(odd))
+    return About(units, named or ":" in "".join(row[at : at + 1]), tuple(odd))
 
 
 def _rows(lines: Sequence[str], head: _Head) -> Iterator[tuple[int, list[str]]]:

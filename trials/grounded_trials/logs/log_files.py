@@ -17,7 +17,7 @@ from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 
 from grounded.errors import GroundedError, needs
 from grounded.findings import found
-from grounded_trials.formats import dataflash, text_tables
+from grounded_trials.formats import dataflash
 from grounded_trials.formats.lerobot import is_episode
 from grounded_trials.formats.mcap_records import MAGIC, Channel, Messages, Record, Rows
 from grounded_trials.formats.mcap_walk import mapped, read_records
@@ -183,20 +183,6 @@ def _load_library(file: Path) -> None:
 def _load(format: Format | None) -> None:
     if format is not None and format.library:
         needs(format.library, format.extra)
-
-
-def column_units(log: Path) -> dict[str, str]:
-    """Return the units that a log states for its numbers, by message path.
-
-    A text table does in its column names, ArduPilot's log in messages of its own.
-    """
-    if log.suffix.lower() in SUFFIXES:
-        return dict(text_tables.about_table(log).units)
-    if not log.is_file():
-        return {}
-    with open_log(log) as stream:
-        stated = stream.read(3) == dataflash.BEGINS
-    return within(log, log.stat().st_size, dataflash.dataflash_units, log) if stated else {}
 
 
 def digest_of(log: Path) -> str:

@@ -17,9 +17,9 @@ import numpy as np
 
 from grounded.checks import near, refused
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import found
+from grounded.findings import Finding, found
 from grounded_trials.formats.bad import Bad, BadMessage, BadPath, BadSchema
-from grounded_trials.formats.mcap_records import Rows
+from grounded_trials.formats.mcap_records import About, Rows
 from grounded_trials.formats.mcap_walk import Part, Topic, by_topic
 from grounded_trials.formats.message_path import MessagePath, parse_path
 from grounded_trials.formats.messages import Decoded, Decoder, Floats, Ints, decoder_of
@@ -61,6 +61,8 @@ class Series:
     log_times: Ints  # (N,) [ns]
     messages: int  # number of messages of its topic, with this number or not
     type: str  # of the topic's messages
+    unit: str = ""  # that the file says
+    findings: tuple[Finding, ...] = ()  # on its file
 
     @cached_property
     def skew_s(self) -> float | None:
@@ -96,7 +98,11 @@ def _read_signals(
     topics, decoders = set[str](), dict[Topic, Decoder]()
     for path in files:
         for one in by_topic(log_records(path, layout), str(path)):
-            if isinstance(one, Part) and one.topic in decoders:
+            if isinstance(one, About):
+                for collector in collectors:
+                    collector.unit = collector.unit or one.units.get(collector.path.text, "")
+                    collector.findings += one.findings
+            elif isinstance(one, Part) and one.topic in decoders:
                 _collect(decoders[one.topic], _wanting(collectors, one.topic), one, str(path))
             elif isinstance(one, Topic):
                 topics.add(one.name)
@@ -152,7 +158,8 @@ class _Collector:
         self.path: MessagePath = parse_path(spec.path)
         self.parts: list[tuple[Ints, Floats, Ints]] = []
         self.messages = 0
-        self.type = ""
+        self.type = self.unit = ""
+        self.findings: tuple[Finding, ...] = ()
 
     def misfit(self, topic: Topic, file: str, error: Bad, at: float | None = None) -> GroundedError:
         """Return the error for a topic that can't be read, or has no such number."""
@@ -188,4 +195,5 @@ class _Collector:
             }
             raise GroundedError(found("file.signal", self.name, **facts))
         t, values, log_times = columns
-        return Series(self.spec, t, values, log_times, self.messages, self.type)
+        told = self.messages, self.type, self.unit, self.findings
+        return Series(self.spec, t, values, log_times, *told)

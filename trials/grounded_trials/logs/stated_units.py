@@ -13,12 +13,10 @@ perhaps not in radians; it is not a length.
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 from grounded.units import ENDINGS, factor_between, unit_ending
-from grounded_trials.logs.log_files import column_units
 
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req|ctrl)$"
@@ -46,12 +44,7 @@ LENGTHS = ("m", "m/s")
 class Stated:
     """The units that a log states: in a table's first row, or at the end of names."""
 
-    heads: Mapping[str, str]
-
-    @classmethod
-    def by(cls, files: Sequence[str | Path]) -> Stated:
-        """Read the units that a log's first file states; names are used in any log."""
-        return cls(column_units(Path(files[0])) if files else {})
+    heads: Mapping[str, str]  # as read, by message path
 
     def unit(self, path: str) -> str:
         """Return the unit of a number, "" if none is stated."""

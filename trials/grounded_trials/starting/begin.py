@@ -24,7 +24,6 @@ from grounded.model import Model
 from grounded.places import heading
 from grounded.result import NULL, UNSAID, Document
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
-from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import Guess, mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
@@ -33,7 +32,6 @@ from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
-from grounded_trials.logs.stated_units import Stated
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.interval import interval_of
@@ -181,7 +179,7 @@ def begin(
         units = {**drawn.model.states, **drawn.model.inputs}
         states, commands = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
         drawn.with_gain((*states, *commands))
-        slow = () if layout.rate or about_table(logs[0]).in_time_units else _in_seconds(report)
+        slow = () if layout.rate or report.timed else _in_seconds(report)
 
         # The control interval, and the ranges: zero is sent after a run, so limits must include it.
         step, note = (dt, ()) if dt else interval_of(report, commands, states)
@@ -336,7 +334,7 @@ def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str,
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    scale = Stated.by(report.files).factor(path, units[guess.name]) if path else 1.0
+    scale = report.stated.factor(path, units[guess.name]) if path else 1.0
     why = (found("start.given", guess.name),)
     field, clock = report.number(path), report.clock(report.topic_of(path))
     return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)

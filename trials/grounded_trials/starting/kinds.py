@@ -189,7 +189,7 @@ def _followers(found: Mapping[str, FieldReport], inputs: Sequence[str]) -> dict[
 def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
     """Return for each position, by name, its rate as an expression of another number of the log."""
     names = {path: name for name, path in paths.items()}
-    signals = Signals(log, (), Stated.by(log.files))
+    signals = Signals(log)
     return {
         names[position]: f"{times:g} * " * (times != 1) + f"s.{names[rate]}"
         for position, (rate, times) in signals.rates(list(names)).items()
@@ -219,7 +219,7 @@ class Clues:
     """
 
     def __init__(self, log: LogReport, joints: Joints) -> None:
-        self.log, self.joints, self.stated = log, joints, Stated.by(log.files)
+        self.log, self.joints, self.stated = log, joints, log.stated
         self.found = moving(log)
         self.sent = {  # the paths of the numbers that are named like commands
             name: one.path
@@ -424,7 +424,7 @@ def _v(plain: Skeleton) -> str:
 
 def _gain(v: Guess, u: Guess, log: LogReport) -> float:
     """Return the speed per unit of command, by least squares; 0 if unknown."""
-    gridded = Signals(log, (), Stated.by(log.files)).grid((v.path, u.path))
+    gridded = Signals(log).grid((v.path, u.path))
     speed, command = (np.zeros(1), np.zeros(1)) if gridded is None else gridded[1]
     command = u.scale * command
     return float(v.scale * speed @ command) / max(float(command @ command), 1e-12)

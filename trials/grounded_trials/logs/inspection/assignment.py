@@ -52,7 +52,6 @@ from grounded_trials.logs.inspection.relations import (
 )
 from grounded_trials.logs.stated_units import (
     LENGTHS,
-    Stated,
     is_angle,
     unit_of,
     without_role,
@@ -142,7 +141,7 @@ class _Table:
         joints: Mapping[str, tuple[str, ...]],
         model: Model | None,
     ) -> None:
-        self.log, self.joints, self.stated = log, joints, Stated.by(log.files)
+        self.log, self.joints, self.stated = log, joints, log.stated
         self.model, own = model, {*states, *inputs}
         rates = rate_states(model) if model is not None else {}
         self.rates = {q: w for q, w in rates.items() if {q, w} <= own}
@@ -165,7 +164,7 @@ class _Table:
         ]
         turn = ("", "rad", "deg")
         angles = {n.path for n in self.numbers if n.known == "rad" or n.said in turn}
-        self.signals = Signals(log, angles, self.stated)
+        self.signals = Signals(log, angles)
         self.at = {number.path: k for k, number in enumerate(self.numbers)}
         self.row = {role.name: r for r, role in enumerate(self.roles)}
         self.points = np.zeros((len(self.roles), len(self.numbers)))

@@ -16,7 +16,7 @@ import numpy as np
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded_trials.formats.bad import Bad, BadPath
-from grounded_trials.formats.mcap_records import Header, Messages, Metadata, Rows
+from grounded_trials.formats.mcap_records import About, Header, Messages, Metadata, Rows
 from grounded_trials.formats.mcap_walk import DamagedFile, Part, Topic, by_topic
 from grounded_trials.formats.message_path import WORLD, MessagePath, is_topic, parse_path
 from grounded_trials.formats.messages import (
@@ -30,10 +30,10 @@ from grounded_trials.formats.messages import (
 )
 from grounded_trials.formats.path_walk import FIELD_LIMIT, evaluate, number_paths
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout
-from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signal_report import SKEW_S
+from grounded_trials.logs.stated_units import Stated
 
 NAMING = {  # types of messages that name joints, and their field
     "/JointState": "name",
@@ -91,6 +91,17 @@ class LogReport:
     meta: Mapping[str, str] = field(default_factory=dict)  # metadata, if grounded wrote the file
     joints: Mapping[str, tuple[str, ...]] = field(default_factory=dict)  # names that topics give
     layout: Layout = AS_IT_SAYS  # what was said of its table
+    about: tuple[About, ...] = ()  # what its files say of their tables
+
+    @cached_property
+    def stated(self) -> Stated:
+        """The units that it states: those of its first file, and in names."""
+        return Stated(self.about[0].units if self.about else {})
+
+    @property
+    def timed(self) -> bool:
+        """Whether its tables say that their times are in seconds, or of the day."""
+        return any(one.timed for one in self.about)
 
     @property
     def numbers(self) -> list[FieldReport]:
@@ -132,7 +143,7 @@ class LogReport:
 
 
 def _findings(log: LogReport) -> tuple[Finding, ...]:
-    odd = [one for file in log.files for one in about_table(file).findings]
+    odd = [one for about in log.about for one in about.findings]
     for topic in log.topics:
         name, bad = topic.topic, [f.path for f in topic.fields if f.not_finite]
         if topic.problem:
@@ -169,7 +180,7 @@ def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT
 
 def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
     library: str | None = None
-    topics, meta = dict[str, _Topic](), dict[str, str]()
+    topics, meta, about = dict[str, _Topic](), dict[str, str](), list[About]()
     damage: Finding | None = None
     for path in files:
         try:
@@ -180,6 +191,8 @@ def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
                     topics.setdefault(one.name, _Topic(one))
                 elif isinstance(one, Part):
                     topics[one.topic.name].add(one.content)
+                elif isinstance(one, About):
+                    about.append(one)
                 elif isinstance(one, Metadata) and one.name == "grounded":
                     meta = one.data
         except DamagedFile as error:
@@ -200,6 +213,7 @@ def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
         damage=damage,
         meta=meta if len(files) == 1 else {},
         joints={n: next(iter(t.joints)) for n, t in topics.items() if len(t.joints) == 1},
+        about=tuple(about),
     )
 
 

@@ -28,7 +28,6 @@ from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy, unwound
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
-from grounded_trials.logs.stated_units import Stated
 from grounded_trials.within import OverBudget
 
 FOLLOWS, SURELY = 0.8, 0.95  # correlation of a rate with a derivative: named so, or not
@@ -82,26 +81,24 @@ class Signals:
     Args:
         log: an inspected log.
         angles: paths of numbers that may wrap, in radians or degrees.
-        stated: the units that the log states.
     """
 
-    def __init__(self, log: LogReport, angles: Collection[str], stated: Stated) -> None:
-        self.stated = stated
-        self._log, self._angles = log, angles
+    def __init__(self, log: LogReport, angles: Collection[str] = ()) -> None:
+        self.log, self._angles = log, angles
         self.found: dict[str, Samples] = {}
         self._missing: set[str] = set()
 
     def read(self, paths: Iterable[str]) -> None:
         """Read the samples of further paths."""
         more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
-        clocks = {p: self._log.clock(self._log.topic_of(p)) for p in more}
+        clocks = {p: self.log.clock(self.log.topic_of(p)) for p in more}
         specs = {p: SignalSpec(p, clock=clock) for p, clock in clocks.items()}  # type: ignore[arg-type]
         try:
-            series = read_signals(self._log.files, specs, self._log.layout) if specs else {}
+            series = read_signals(self.log.files, specs, self.log.layout) if specs else {}
         except OverBudget:
             raise
         except GroundedError:
-            series = _one_by_one(self._log, specs)
+            series = _one_by_one(self.log, specs)
         for path, one in series.items():
             try:
                 found = tidy(path, one, unwrap="@rpy" in path)
@@ -219,7 +216,7 @@ def by_inputs(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> d
         paths = {n: guesses[n].path for n in known} | dict(zip(unsure, chosen, strict=True))
         gridded = signals.grid(list(paths.values()))
         if gridded is not None:
-            own = signals.stated
+            own = signals.log.stated
             scales = [guesses[name].scale * own.factor(paths[name], units[name]) for name in known]
             left[chosen] = _left(model, gridded[0], np.column_stack(gridded[1]) * scales)
 

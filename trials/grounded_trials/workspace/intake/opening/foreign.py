@@ -21,7 +21,6 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.formats.text_tables import about_table
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_records, read_apart
 from grounded_trials.logs.log_paths import log_files
@@ -149,7 +148,10 @@ class ForeignLog:
         """The columns in a multiple of the model's unit without a scale in [log]."""
         from grounded_trials.logs.stated_units import Stated
 
-        model, said = self.workspace.base_model, Stated.by(log_files(self.path))
+        model, said = (
+            self.workspace.base_model,
+            Stated({one.spec.path: one.unit for one in self.series.values()}),
+        )
         units, some = {**model.states, **model.inputs}, []
         for name, one in self.series.items():  # including that of [log.span]
             path, wanted = one.spec.path, units.get(name, "")
@@ -370,7 +372,7 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
     early = grid.interpolated_s / trial.dt > EARLY_SHARE
     facts |= {INTERPOLATED: f"{grid.interpolated_s:.3g}"} if early else {}
     encoded = encode(log.workspace, trial, facts, grid.start_ns)
-    remarks = [one for file in log_files(log.path) for one in about_table(file).findings]
+    remarks = next(iter(log.series.values())).findings
     return Read(
         trial,
         encoded,
