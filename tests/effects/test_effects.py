@@ -1,11 +1,12 @@
 """Every effect: adopted and diagnosed one equation, it compiles, it is absent at its start."""
 
 import itertools
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from grounded import GroundedError, Model, Param, Trial
+from grounded import GroundedError, Model, Param
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.predictor import Predictor
@@ -22,41 +23,34 @@ from grounded.effects import (
     scales_of,
     wrap,
 )
+from grounded.effects.actuator import first_order_lag, rate_limit
+from grounded.effects.drive import weights_at
+from grounded.effects.memory import Sent, shifted_within
+from grounded.models.arm import model as arm
 from grounded.models.car import model as car
+from stepped import logged, slopes, stepped
 
 DT = 0.05
 
 
-def drive(model=car, seed=0, steps=60):
-    """A run of the model itself under lively inputs."""
-    rng = np.random.default_rng(seed)
-    t = np.arange(steps) * DT
+def drive(steps=60):
+    """A run of the car itself under lively inputs."""
+    rng, t = np.random.default_rng(0), np.arange(steps) * DT
     u = np.stack([0.5 * np.sin(2 * t + 1), 0.45 + 0.3 * np.sin(1.3 * t)], axis=1)
-    u = u[:, : model.m] + 0.05 * rng.standard_normal((steps, model.m))
-    x = [np.full(model.n, 0.1)]
-    for row in u:
-        x.append(model.system.step(x[-1][None], row[None], model.values, DT)[0])
-    held = np.zeros(model.m)
-    return Trial(np.array(x), u, DT, model.state_names, model.input_names, start_inputs=held)
-
-
-def sizes(trial, model=car):
-    return scales_of(model, trial.states, trial.inputs, DT, trial.steps * DT)
+    u += 0.05 * rng.standard_normal((steps, 2))
+    return logged(car, stepped(car, u, DT, np.full(car.n, 0.1)), u, DT)
 
 
 def typical(effect):
     """A middling value of every quantity."""
-    values = {}
-    for q in effect.free:
-        if q.grid:
-            values[q.name] = float(np.sort(q.grid)[len(q.grid) // 2])
-        else:
-            values[q.name] = 0.02
-    return values
+    return {
+        q.name: float(np.sort(q.grid)[len(q.grid) // 2]) if q.grid else 0.02 for q in effect.free
+    }
 
 
 TRIAL = drive()
-EFFECTS = Library().candidates(car, sizes(TRIAL))
+SIZES = scales_of(car, TRIAL.states, TRIAL.inputs, DT, TRIAL.steps * DT)
+EFFECTS = Library().candidates(car, SIZES)
 ONE_EACH = list({e.family.name: e for e in reversed(EFFECTS)}.values())
 
 
@@ -93,18 +87,11 @@ def test_an_adopted_effect_is_the_one_that_was_diagnosed(effect):
 def test_an_adopted_effect_compiles_and_its_derivatives_are_right(effect):
     wrapped = wrap(effect, typical(effect), DT)
     assert wrapped.system.how == "compiled", wrapped.system.note
-    rng = np.random.default_rng(1)
-    x = rng.uniform(0.2, 0.9, (4, wrapped.n))
-    u = rng.uniform(0.3, 0.8, (4, wrapped.m))
-    f_x, f_u = wrapped.system.linearise(x, u, wrapped.values, DT)
-    h = 1e-6
-    for j in range(wrapped.n):
-        nudge = np.zeros(wrapped.n)
-        nudge[j] = h
-        ends = [wrapped.system.step(x + s * nudge, u, wrapped.values, DT) for s in (1, -1)]
-        np.testing.assert_allclose(
-            f_x[:, :, j], (ends[0] - ends[1]) / (2 * h), atol=2e-4, rtol=1e-4
-        )
+    rng, p = np.random.default_rng(1), wrapped.values
+    x, u = rng.uniform(0.2, 0.9, (4, wrapped.n)), rng.uniform(0.3, 0.8, (4, wrapped.m))
+    f_x, f_u = wrapped.system.linearise(x, u, p, DT)
+    found = slopes(lambda at: wrapped.system.step(at, u, p, DT), x)
+    np.testing.assert_allclose(f_x, found, atol=2e-4, rtol=1e-4)
     assert np.isfinite(f_u).all()
 
 
@@ -149,7 +136,7 @@ def test_a_third_party_family_is_one_value():
         rate=lambda s, a, own, t, c, site: {site.target: -c["k"] * s[site.target] ** 3},
     )
     library = Library().with_families([drag])
-    effect = library.effect("cubic_drag:v", car, sizes(TRIAL))
+    effect = library.effect("cubic_drag:v", car, SIZES)
     assert wrap(effect, {"k": 0.1}, DT).system.how == "compiled"
     with pytest.raises(GroundedError, match="cubic_drag"):
         library.with_families([drag])
@@ -178,34 +165,14 @@ def test_several_effects_wrap_one_another():
         ("first_order_lag:steering", {"tau": 0.1}),
         ("delay:throttle", {"d": 0.07}),
     ):
-        model = wrap(Library().effect(name, model, sizes(TRIAL)), values, DT)
+        model = wrap(Library().effect(name, model, SIZES), values, DT)
     assert model.system.how == "compiled"
     assert model.n == car.n + 1 + 3
     assert memory_of(model, car, TRIAL).shape == (TRIAL.steps + 1, 4)
 
 
-def test_sensor_delay():
-    """A logged heading that is 0.1 s old is the true heading two steps ago."""
-    effect = Library().effect("sensor_delay:psi", car, sizes(TRIAL))
-    wrapped = wrap(effect, {"d": 2 * DT}, DT)
-    memory = memory_of(wrapped, car, TRIAL)
-    z = np.concatenate([TRIAL.states[20], memory[20]])
-    after = wrapped.system.step(z[None], TRIAL.inputs[20][None], wrapped.values, DT)[0]
-    names = wrapped.state_names
-    # d = 2 steps: the log of step 21 is the truth of step 19, which step 20 calls "one ago"
-    assert after[names.index("psi")] == pytest.approx(z[names.index("psi_true_1")], abs=1e-12)
-
-
-def test_the_docs_have_a_row_for_every_family():
-    from pathlib import Path
-
-    text = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
-    for family in Library().families:
-        assert f"| `{family.name}` |" in text
-
-
 def test_an_adopted_sensor_lag_is_a_filter():
-    effect = Library().effect("sensor_lag:v", car, sizes(TRIAL))
+    effect = Library().effect("sensor_lag:v", car, SIZES)
     assert isinstance(effect.family, SensorLagFamily)
     model = wrap(effect, {"tau": 0.2}, DT)
     one = TRIAL.until(40)
@@ -222,3 +189,108 @@ def test_an_adopted_sensor_lag_is_a_filter():
         filtered.append(fine)
     np.testing.assert_allclose(logged, filtered, atol=2e-3 * np.ptp(true))
     assert np.abs(logged - true).max() > 0.02
+
+
+def test_a_logged_heading_that_is_two_steps_old_is_the_true_one_of_then():
+    wrapped = wrap(Library().effect("sensor_delay:psi", car, SIZES), {"d": 2 * DT}, DT)
+    z = np.concatenate([TRIAL.states[20], memory_of(wrapped, car, TRIAL)[20]])
+    after = wrapped.system.step(z[None], TRIAL.inputs[20][None], wrapped.values, DT)[0]
+    names = wrapped.state_names
+    # the log of step 21 is the truth of step 19, which step 20 calls "one ago"
+    assert after[names.index("psi")] == pytest.approx(z[names.index("psi_true_1")], abs=1e-12)
+
+
+def test_the_docs_have_a_row_for_every_family():
+    text = (Path(__file__).parents[2] / "docs" / "effects.md").read_text(encoding="utf-8")
+    assert all(f"| `{family.name}` |" in text for family in Library().families)
+
+
+@pytest.mark.parametrize("tau", [0.02, 0.07])
+def test_a_long_way_goes_at_the_limit_and_arrives(tau, dt=0.02):
+    """However stiff the model that drives it."""
+    servo = Model(
+        states={"angle": "rad"},
+        inputs={"command": "rad"},
+        params={"tau": Param(tau, "s", std=0.3 * tau)},
+        derivative=lambda s, a, p: {"angle": (a.command - s.angle) / p.tau},
+    )
+    fast = wrap(Library().effect("slew_limit:angle", servo), {"r": 1.5}, dt)
+    x = stepped(fast, np.full(60, 0.6), dt)[:, 0]
+    np.testing.assert_allclose(x[1:16], 1.5 * dt * np.arange(1, 16), atol=1e-12)
+    assert x[-1] == pytest.approx(0.6, abs=1e-3)
+    assert np.diff(x).max() <= 1.5 * dt + 1e-12
+
+
+STEP, FINE = 0.02, 200
+
+
+def received(name, value, commands):
+    """The torque at the middle of every fine part of every step, (T, FINE)."""
+    t = (np.arange(FINE) + 0.5) / FINE * STEP
+    found, z = [], commands[0]
+    late = np.concatenate([np.repeat(commands[:1], 50), commands])
+    for k, u in enumerate(commands):
+        if name == "delay":
+            back = np.floor((k * STEP + t - value) / STEP + 1e-9).astype(int)
+            found.append(late[back + 50])
+        elif name == "first_order_lag":
+            found.append(u + (z - u) * np.exp(-t / value))
+            z = u + (z - u) * np.exp(-STEP / value)
+        else:
+            found.append(z + np.clip(u - z, -value * t, value * t))
+            z += float(np.clip(u - z, -value * STEP, value * STEP))
+    return np.array(found)
+
+
+CASES = [("delay", 0.0083), ("delay", 0.0312), ("first_order_lag", 0.012), ("rate_limit", 15.0)]
+
+
+@pytest.mark.parametrize(("name", "value"), CASES)
+def test_a_lead_is_the_first_moment_of_what_arrives_in_a_step(name, value):
+    rng = np.random.default_rng(1)
+    u = np.repeat(rng.uniform(-1, 1, 50), 3) + 0.2 * rng.standard_normal(150)
+    arriving = received(name, value, u)
+    early = 0.5 - (np.arange(FINE) + 0.5) / FINE
+    expected = (early * arriving).mean(axis=1)
+    if name == "delay":
+        still = np.zeros((1, len(u)))
+        (mean,), (found,) = shifted_within(
+            Sent(u[None], u[:1], still, u[None], still), value / STEP
+        )
+        np.testing.assert_allclose(mean, arriving.mean(axis=1), atol=2e-3)
+    else:
+        family = {"first_order_lag": first_order_lag, "rate_limit": rate_limit}[name]
+        c = {"tau": value} if name == "first_order_lag" else {"r": value}
+        found = family.lead(u, family.along(u[None], u[:1], c, STEP)[0], c, STEP)
+    np.testing.assert_allclose(found, expected, atol=2e-3)
+    assert np.abs(expected).max() > 0.02
+
+
+def test_the_weights_of_a_wheels_speed_follow_the_track():
+    cart = Model(
+        name="cart",  # as a textbook has it, with a crude track
+        states={"psi": "rad", "v": "m/s", "r": "rad/s"},
+        inputs={"left": "1", "right": "1"},
+        params={
+            "k": Param(0.8, "m/s", 0.3, 2.0),
+            "track": Param(0.25, "m", 0.15, 0.5),
+            "tau": Param(0.2, "s", 0.03, 1.0),
+            "tau_r": Param(0.2, "s", 0.03, 1.0),
+        },
+        angles=("psi",),
+        derivative=lambda s, a, p: {
+            "psi": s.r,
+            "v": (p.k * (a.left + a.right) / 2 - s.v) / p.tau,
+            "r": (p.k * (a.right - a.left) / p.track - s.r) / p.tau_r,
+        },
+    )
+    crudely = dict(zip(cart.param_names, cart.values, strict=True))
+    values = crudely | {"track": 0.3, "tau_r": 0.1, "delay_d": 0.02}  # of an adopted effect, too
+    for name, side in (("left", -1), ("right", 1)):
+        at = weights_at(cart, f"{name}<-v+r", values)
+        crude = weights_at(cart, f"{name}<-v+r", crudely)
+        other = {one for one in at if one != next(iter(at))}.pop()
+        ratio = {"r": 0.15, "v": 1 / 0.15}[other]
+        assert at[other] == pytest.approx(side * ratio, rel=1e-6)
+        assert crude[other] == pytest.approx(side * (0.125 if other == "r" else 8.0), rel=1e-6)
+    assert weights_at(arm, "tau1<-w1", {}) == {"w1": 1.0}

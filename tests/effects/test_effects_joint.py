@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
+from grounded import Model, Param
 from grounded.compile import Named
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -17,6 +17,7 @@ from grounded.effects.losses import dry
 from grounded.models.aircraft import model as aircraft
 from grounded.models.car import model as car
 from grounded.models.pendulum import model as pendulum
+from stepped import logged, stepped
 
 DT = 0.02
 
@@ -64,22 +65,17 @@ def rates(x, u, c, J, k=(0.0, 0.0)):
 
 
 def real_trials(count=3, steps=100, c=(0.0, 0.0), J=(0.0, 0.0), k=(0.0, 0.0)):
-    """The arm with friction and springs in its joints, 40 midpoint steps a control step; noise."""
-    rng, found, h = np.random.default_rng(1), [], DT / 40
+    """Logs of the arm with friction and springs in its joints, in fine steps, with noise."""
+    rng, found, t = np.random.default_rng(1), [], DT * np.arange(steps)
     for _ in range(count):
-        t, w = DT * np.arange(steps), rng.uniform(2, 7, 4)
+        w = rng.uniform(2, 7, 4)
         u = np.stack([1.5 * np.sin(w[0] * t) + np.sin(w[1] * t), 0.4 * np.sin(w[2] * t)], 1)
         u[:, 1] += 0.3 * np.sin(w[3] * t)
-        x, states = np.zeros(4), [np.zeros(4)]
-        for row in u:
-            for _ in range(40):
-                x = x + h * rates(x + 0.5 * h * rates(x, row, c, J, k), row, c, J, k)
-            x = x + np.array([0, 0, 2e-3, 4e-3]) * rng.standard_normal(4)
-            states.append(x)
-        y = np.array(states) + np.array([5e-4, 5e-4, 1e-2, 1e-2]) * rng.standard_normal(
-            (steps + 1, 4)
-        )
-        found.append(Trial(y, u, DT, arm.state_names, arm.input_names, start_inputs=np.zeros(2)))
+        x = stepped(
+            lambda x, u: rates(x, u, c, J, k), u, DT, np.zeros(4),
+            disturbed=np.array([0, 0, 2e-3, 4e-3]), rng=rng,
+        )  # fmt: skip
+        found.append(logged(arm, x, u, DT, [5e-4, 5e-4, 1e-2, 1e-2], rng))
     return found
 
 

@@ -1,6 +1,5 @@
 """What moves or pushes a vehicle over ground: a current and a push, in the axes of the ground."""
 
-from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -15,8 +14,9 @@ from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.effects import Effect, Library, scales_of, wrap, wrapping_order
 from grounded.search.planner import planner_with
 from small_tasks import plain_task
+from stepped import logged, slopes, stepped
 
-DT, FINE = 0.1, 20
+DT = 0.1
 CURRENT = ("current:u+v", {"a": 0.15, "b": -0.08})
 PUSH = ("push_world:u+v", {"a": 0.15, "b": -0.08})
 DRAG = ("quadratic_drag:u", {"k": 0.3})
@@ -64,27 +64,19 @@ boat = boat_of(**SIZES)
 
 def driven(count=3, steps=150, **truth: tuple[float, ...]) -> list[Trial]:
     """Trials of the real boat, in fine steps of other code, with noise."""
-    rng, found, h = np.random.default_rng(5), [], DT / FINE
+
+    def moved(x: Any, u: Any) -> Any:
+        s, a = dict(zip(STATES, x, strict=True)), dict(zip(INPUTS, u, strict=True))
+        return np.array(list(rates(s, a, SIZES, **truth).values()))
+
+    rng, found, t = np.random.default_rng(5), [], DT * np.arange(steps)
+    disturbed = np.array([4e-3, 4e-3, 4e-3, 0, 0, 0])
     for _ in range(count):
-        w, t = rng.uniform(0.3, 1.2, 3), DT * np.arange(steps)
+        w = rng.uniform(0.3, 1.2, 3)
         thrust = 0.5 + 0.3 * np.sign(np.sin(w[0] * t + 1))
         u = np.stack([thrust, 0.8 * np.sign(np.sin(w[1] * t)) * np.abs(np.sin(w[2] * t))], axis=1)
-        x = np.zeros(6)
-        states = [x]
-        for row in u:
-            a = dict(zip(INPUTS, row, strict=True))
-            for _ in range(FINE):
-
-                def f(z: Any, a: Mapping[str, Any] = a) -> Any:
-                    s = dict(zip(STATES, z, strict=True))
-                    return np.array(list(rates(s, a, SIZES, **truth).values()))
-
-                x = x + h * f(x + 0.5 * h * f(x))
-            x = x + np.array([4e-3, 4e-3, 4e-3, 0, 0, 0]) * rng.standard_normal(6)
-            states.append(x)
-        noise = np.array([0.01, 0.01, 6e-3, 0.01, 0.01, 4e-3]) * rng.standard_normal((steps + 1, 6))
-        y = np.array(states) + noise
-        found.append(Trial(y, u, DT, tuple(STATES), tuple(INPUTS), start_inputs=np.zeros(2)))
+        x = stepped(moved, u, DT, np.zeros(6), disturbed=disturbed, rng=rng)
+        found.append(logged(boat, x, u, DT, [0.01, 0.01, 6e-3, 0.01, 0.01, 4e-3], rng))
     return found
 
 
@@ -150,23 +142,18 @@ def test_an_adopted_medium_is_the_one_that_was_diagnosed(parts):
 def test_its_slopes_are_those_of_its_steps(parts):
     """A current's exactly; where a rate's kick moves the model, to two per cent, as of any rate."""
     data = prepare(boat, TRIALS[:1])
-    predictor, h, size = Predictor(data), hypothesis(*parts), 1e-6
+    predictor, h = Predictor(data), hypothesis(*parts)
     x, u = data.y[:-1], predictor.inputs(h)
     F = step_jacobian(predictor, h, data.y)
     both, by_param = sensitivities_of(predictor, h, x, u)
     np.testing.assert_allclose(both, F, atol=1e-12)
-
-    def near(found, ends):
-        error = np.abs(found - (ends[0] - ends[1]) / (2 * size)).max(axis=-1)
-        assert np.quantile(error, 0.9) < (1e-6 if parts == (CURRENT,) else 0.02)
-
-    for j in range(boat.n):
-        nudge = size * np.eye(boat.n)[j]
-        near(F[..., j], [predictor.advance(h, x + s * nudge, u, data.time) for s in (1, -1)])
-    for k in range(len(boat.params)):
-        shifts = [s * size * np.eye(len(boat.params))[k] for s in (1, -1)]
-        moved = [replace(h, shift=shift) for shift in shifts]
-        near(by_param[..., k], [predictor.advance(one, x, u, data.time) for one in moved])
+    of_states = slopes(lambda at: predictor.advance(h, at, u, data.time), x)
+    of_params = slopes(
+        lambda shift: predictor.advance(replace(h, shift=shift), x, u, data.time), np.zeros(3)
+    )
+    for found, expected in ((F, of_states), (by_param, of_params)):
+        error = np.quantile(np.abs(found - expected).max(axis=-2), 0.9, axis=(0, 1))
+        assert (error < (1e-6 if parts == (CURRENT,) else 0.02)).all()
 
 
 def test_a_drag_that_joins_a_model_with_a_current_acts_through_the_water():

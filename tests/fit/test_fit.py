@@ -1,19 +1,25 @@
-"""Recovers known parameters with correct intervals, and reports unidentified ones."""
+"""A fit recovers parameters with correct intervals; what the data can't tell is named."""
 
-import dataclasses
-import os
-from pathlib import Path
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from facts import holding
+from facts import holding, of_code
+from grounded import Model, Param, Trial
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
+from grounded.diagnosis.hypotheses.search import HypothesisSearch
+from grounded.diagnosis.likelihood.data import prepare
+from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.validation.choose import Gain
+from grounded.diagnosis.validation.identifiable import identified
+from grounded.effects import Library
+from grounded.effects.sensor import lagging
 from grounded.errors import GroundedError
 from grounded.fit import fit
-from grounded.model import Model, Param
 from grounded.models.pendulum import model as pendulum
-from grounded.trial import Trial
+from shared_data import data as shared_file
+from stepped import levels, library, logged, stepped
 
 DT = 0.05
 SPRING = Model(
@@ -54,16 +60,6 @@ def simulated(model, seed, noise, *, B=4, T=150, latency=0.0, low=-1.0, high=1.0
     y, names = x + np.array(noise[1]) * rng.standard_normal(x.shape), (model.state_names,)
     held = {"input_names": model.input_names, "start_inputs": np.zeros(model.m)}
     return [Trial(y[:, b], u[:, b], DT, *names, **held) for b in range(B)]
-
-
-def shared():
-    """The folder of real data: beside the checkout, or in GROUNDED_SHARED."""
-    if "GROUNDED_SHARED" in os.environ:
-        return Path(os.environ["GROUNDED_SHARED"])
-    for folder in Path(__file__).resolve().parents:
-        if (folder / "shared" / "data").is_dir():
-            return folder / "shared"
-    pytest.skip("no ../shared with real data")
 
 
 LOUD = ((1e-4, 1e-3), (0.03, 0.2))
@@ -154,25 +150,25 @@ def test_misuse_says_what_to_do():
 def test_held_out_errors_decide_whether_a_fit_helps():
     found = fit(SPRING.with_values({"k": 9.0}), simulated(SPRING, 0, NOISE, B=1, T=60))
     assert found.gain is None and not found.worse and found.helps  # nothing was held out
-    assert not dataclasses.replace(found, nats=0.0).helps
+    assert not replace(found, nats=0.0).helps
 
     def judged(mean, whole=0.0):
         gain, loss = (
             Gain(m, m, np.full(2, m), (m, 0.02), (w, 0.001))
             for m, w in ((mean, whole), (-mean, -whole))
         )
-        return dataclasses.replace(found, gain=gain, loss=loss)
+        return replace(found, gain=gain, loss=loss)
 
     assert judged(0.5).helps and not judged(0.5).worse
     assert judged(-0.5).worse and not judged(-0.5).helps
     assert not judged(0.005).helps and not judged(-0.005).worse
     assert judged(0.5, -0.5).worse and not judged(0.5, -0.5).helps
-    moved = dataclasses.replace(found.params["d"], value=0.0, identified=True)
-    assert "d" in dataclasses.replace(found, params={"d": moved}).at_bounds
+    moved = replace(found.params["d"], value=0.0, identified=True)
+    assert "d" in replace(found, params={"d": moved}).at_bounds
 
 
 def test_the_real_dart_car_has_a_dead_zone():
-    data = np.load(shared() / "data" / "dart_small_car" / "throttle_steps_rubber_10Hz.npz")
+    data = np.load(shared_file("dart_small_car", "throttle_steps_rubber_10Hz.npz"))
     column = list(data["columns"]).index
     trials = []
     for run in range(len(data["files"])):
@@ -198,3 +194,131 @@ def test_the_real_dart_car_has_a_dead_zone():
     assert found.loglik > plain.loglik + 100
     less, more = (one.prediction_error[-1].with_effects["v"] for one in (found, plain))
     assert less < 0.7 * more
+
+
+def test_a_filter_of_speeds_is_not_fitted_as_friction(dt=0.02):
+    """Positions quantised to 0.05 mm, and speeds that a sensor filters by 30 ms."""
+    axis = Model(
+        name="axis",
+        states={"x": "m", "v": "m/s"},
+        inputs={"volts": "V"},
+        params={
+            "k": Param(2.0, "m/s^2/V", 0.5, 8.0),
+            "b": Param(3.0, "1/s", 0.1, 20.0),
+            "c": Param(0.0, "m/s^2", 0.0, 2.0),
+        },
+        roles={"position": ("x",), "speed": "v"},
+        derivative=lambda s, a, p: {
+            "x": s.v,
+            "v": p.k * a.volts - p.b * s.v - p.c * np.tanh(s.v / 0.02),
+        },
+        substeps=4,
+    )
+    true, rng, trials = {"k": 4.0, "b": 6.0, "c": 0.5}, np.random.default_rng(0), []
+    for _ in range(3):
+        volts = levels(rng, 20, 10)
+        x, v = stepped(axis.with_values(true), volts, dt).T
+        off, shown = 0.0, v.copy()
+        for t in range(1, len(v)):
+            off = lagging(off, v[t] - v[t - 1], 0.03, dt)
+            shown[t] += off
+        states = np.column_stack([np.round(x / 5e-5) * 5e-5, shown])
+        trials.append(logged(axis, states, volts, dt, [0.0, 1e-3], rng))
+    found = fit(replace(axis, substeps=1), trials)
+    assert [one.kind for one in found.preflight if one.corrected] == ["lag"]
+    for name, value in true.items():
+        assert found.params[name].value == pytest.approx(value, rel=0.03)
+        assert found.params[name].low < value < found.params[name].high
+    assert tuple(found.prediction_error[-1].crude) == axis.state_names
+    assert found.helps and {*found.params} == {*true}
+
+
+def motor(**params):
+    return Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params=params,
+        derivative=lambda s, a, p: {"v": (p.gain * a.u - p.drag * s.v) / p.mass},
+    )
+
+
+@pytest.fixture(scope="module")
+def trials():
+    real = motor(mass=Param(2.0), gain=Param(3.0), drag=Param(0.5))
+    rng = np.random.default_rng(3)
+    sent = [levels(rng, 7, 8) for _ in range(3)]
+    return [logged(real, stepped(real, u, DT), u, DT, 1e-3, rng) for u in sent]
+
+
+@pytest.mark.slow
+def test_a_constant_is_neither_fitted_nor_blamed_nor_calibrated(trials):
+    model = motor(mass=Param(2.0, "kg"), gain=Param(3.0), drag=Param(0.3, "N s/m", 0.0, 2.0))
+    found = fit(model, trials)
+    assert list(found.params) == ["drag"] and found.params["drag"].value == pytest.approx(0.5, 0.1)
+    assert found.model.params["mass"] == model.params["mass"]
+    with pytest.raises(GroundedError, match="'mass'"):
+        fit(model, trials, ["mass"])
+    diagnosis = diagnose(model, trials)
+    assert set(diagnosis.parameters) <= {"drag"}
+    assert not {"parameter:mass", "parameter:gain"} & {row.effect for row in diagnosis.ranking}
+    assert [one.parameter for one in diagnosis.identifiable] == ["drag"]
+    constants = motor(mass=Param(2.0), gain=Param(3.0), drag=Param(0.3))
+    with pytest.raises(GroundedError, match=holding(f"'{constants.name}'")):
+        fit(constants, trials)
+
+
+@pytest.mark.slow
+def test_of_a_combination_the_surest_parameter_stays(trials):
+    """Only gain / mass and drag / mass are identified."""
+    model = motor(
+        mass=Param(2.0, "kg", std=0.1), gain=Param(2.5, std=0.5), drag=Param(0.4, std=0.2)
+    )
+    found = fit(model, trials)
+    assert not found.params["mass"].identified and found.params["mass"].value == 2.0
+    assert found.params["gain"].identified and found.params["gain"].value == pytest.approx(3, 0.03)
+    assert found.params["gain"].only_with == found.params["drag"].only_with == ("mass",)
+    (one,) = [one for one in found.findings if one.code == "model.given"]
+    assert one.facts["rests"] == ("mass",)
+    diagnosis = diagnose(model, trials)
+    verdicts = {one.parameter: one.verdict for one in diagnosis.identifiable}
+    assert verdicts["mass"] == "not identifiable"
+    assert "mass" not in diagnosis.known_parameters
+
+
+def test_a_parameter_that_is_found_off_is_identified_by_what_shows_that(trials):
+    model = motor(mass=Param(2.0), gain=Param(2.0, "1", 0.1, 20), drag=Param(0.5, "1", 0.05, 10))
+    data = prepare(model, trials, np.zeros(1))
+    search = HypothesisSearch(data, Library().candidates(model, data.scales))
+    search.nulls()
+    off = Library().effect("parameter:gain", model, data.scales)
+    start = search.fresh(Hypothesis(shift=np.zeros(3), spread=1.0).plus(off, {"d": 1.0}))
+    (found, *_) = search.refined([start], 12)
+    assert found.hypothesis.values[0]["d"] == pytest.approx(1.0, abs=0.1)
+    verdicts = {
+        one.parameter: one.verdict for one in identified(search.predictor, found).parameters
+    }
+    assert verdicts == {"gain": "identifiable", "drag": "identifiable"}
+
+
+def test_parameters_that_are_known_only_together_are_written_together():
+    """At speeds near 1, two drags of 0.6 show nearly as one."""
+    model = Model(
+        states={"v": "m/s"},
+        inputs={"u": "N"},
+        params={"a": Param(0.5, std=0.1), "b": Param(0.5, std=0.1)},
+        derivative=lambda s, a, p: {"v": a.u - p.a * s.v - p.b * s.v**2},
+    )
+    rng, real, drags = np.random.default_rng(5), model.with_values({"a": 0.6, "b": 0.6}), []
+    for _ in range(4):
+        u = 1.2 + levels(rng, 10, 8, 0.1)
+        drags.append(logged(model, stepped(real, u, DT, [1.0]), u, DT, 0.02, rng))
+    diagnosis = diagnose(model, drags, DiagnosisOptions(library=library("offset")))
+    assert [c.of for c in diagnosis.credit] == ["calibration"]
+    assert {i.verdict for i in diagnosis.identifiable} == {"not identifiable"}
+    assert diagnosis.jointly == {"a", "b"} == set(diagnosis.known_parameters)
+    total = sum(e.value for e in diagnosis.known_parameters.values())
+    assert total == pytest.approx(1.2, abs=0.01)
+    written = diagnosis.to_json()["identifiable"]
+    assert all(one["jointly"] for one in written)
+    (one,) = of_code(diagnosis, "model.given")
+    assert one.about == ("a", "b")

@@ -1,11 +1,12 @@
-"""Trial: arrays of matching shapes, read-only, and finite up to a known step."""
+"""Trials: arrays of matching shapes; lost samples; a share of very many."""
 
 import numpy as np
 import pytest
 
 from grounded.errors import GroundedError
 from grounded.frozen import readonly
-from grounded.trial import Trial
+from grounded.share import share_of
+from grounded.trial import Trial, interpolate_gaps
 
 
 def trial(T=5, **changes):
@@ -85,3 +86,75 @@ def test_a_trial_is_shown_in_one_short_line():
     assert "\n" not in shown
     assert len(shown) < 100
     assert all(part in shown for part in ("t0007", "500", "0.02", "q, w"))
+
+
+def gappy(gaps=(), T=60, dt=0.05):
+    t = dt * np.arange(T + 1)
+    states = np.column_stack([t, np.sin(t)])
+    for first, last, column in gaps:
+        states[first:last, column] = np.nan
+    return Trial(states, np.zeros((T, 1)), dt, ("x", "v"), ("u",))
+
+
+def test_short_gaps_are_straight_lines():
+    found = interpolate_gaps(gappy([(5, 9, 0), (30, 40, 1)]))
+    np.testing.assert_allclose(found.trial.states[:, 0], gappy().states[:, 0], atol=1e-12)
+    assert np.abs(found.trial.states[:, 1] - gappy().states[:, 1]).max() < 0.05
+    assert (found.samples, found.state) == (14, "v")
+    assert found.longest_s == pytest.approx(0.5) and found.at_s == pytest.approx(1.5)
+
+
+@pytest.mark.parametrize(("length", "whole"), [(20, True), (21, False)])
+def test_a_gap_of_a_second_is_the_longest(length, whole):
+    found = interpolate_gaps(gappy([(10, 10 + length, 0)]))
+    assert np.isfinite(found.trial.states).all() == whole
+    assert found.trial.finite_steps == (60 if whole else 9)
+
+
+def test_a_gap_that_reaches_the_end_stays():
+    found = interpolate_gaps(gappy([(56, 61, 1)]))
+    assert found.samples == 0 and found.trial.finite_steps == 55
+
+
+def test_the_first_state_must_be_known():
+    found = interpolate_gaps(gappy([(0, 2, 0), (10, 12, 1)]))
+    assert found.samples == 0 and found.trial.finite_steps == -1
+
+
+def test_inputs_are_never_invented():
+    whole = gappy([(5, 6, 0)])
+    inputs = np.array(whole.inputs)
+    inputs[20] = np.nan
+    found = interpolate_gaps(Trial(whole.states, inputs, 0.05, ("x", "v"), ("u",)))
+    assert found.samples == 1 and found.trial.finite_steps == 20
+
+
+def many(*steps):
+    return [
+        Trial(np.zeros((T + 1, 1)), np.zeros((T, 1)), 0.1, ("x",), ("u",), id=f"t{i}")
+        for i, T in enumerate(steps)
+    ]
+
+
+def test_all_trials_within_the_budget_are_used_as_they_are():
+    given = many(10, 20)
+    found = share_of(given, 30)
+    assert found.trials == given and found.finding is None
+
+
+@pytest.mark.parametrize("steps", [[10] * 1000, [1000], [5, 400, 5, 5], [90, 90, 90]])
+def test_a_share_stays_within_the_budget_and_says_which_it_is(steps):
+    found = share_of(many(*steps), 100)
+    assert 0 < sum(trial.steps for trial in found.trials) <= 100
+    assert found.finding is not None and found.finding.facts["total"] == sum(steps)
+
+
+def test_whole_trials_are_taken_at_equal_distances():
+    found = share_of(many(*[10] * 100), 110)
+    numbers = [int(trial.id[1:]) for trial in found.trials]
+    assert numbers[0] == 0 and numbers[-1] == 99 and np.ptp(np.diff(numbers)) <= 1
+    assert all(trial.steps == 10 for trial in found.trials)
+
+
+def test_a_share_has_no_more_trials_than_are_asked_for():
+    assert len(share_of(many(*[2] * 50), 1000, 10).trials) == 10

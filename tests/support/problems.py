@@ -77,30 +77,43 @@ def system(name: str, make=system_of, kind: str = "derivative", integrator: str 
     return made, np.array(list(spec["params"].values()))
 
 
+def plain(system: Any, p: Any, horizon: int, dt: float, **changes: Any) -> Problem:
+    """Return a problem without limits, delays or bias: from rest to zero, with weights of one."""
+    n, m, H = system.n, system.m, horizon
+    fields: dict[str, Any] = {
+        "start": np.zeros(n),
+        "past": np.zeros(m),
+        "delay": np.zeros(m),
+        "bias": np.zeros((H, n)),
+        "target": np.zeros((H + 1, n)),
+        "state_weight": np.ones((H + 1, n)),
+        "input_target": np.zeros((H, m)),
+        "input_weight": np.ones(m),
+        "change_weight": np.ones(m),
+        "low": np.full(m, -np.inf),
+        "high": np.full(m, np.inf),
+        "angles": np.zeros(n, bool),
+    }
+    return Problem(system, p=p, dt=dt, **fields | changes)
+
+
 def problem(name: str, horizon: int = 40, seed: int = 0, make=system_of, **changes: Any) -> Problem:
     """Return a tracking problem with random weights, targets and bias for a named model."""
     rng = np.random.default_rng(seed)
     sys, p = system(name, make)
     n, m, H = sys.n, sys.m, horizon
     fields: dict[str, Any] = {
-        "system": sys,
-        "p": p,
-        "dt": 0.05,
         "start": rng.normal(size=n) * 0.3,
         "past": rng.normal(size=m) * 0.1,
-        "delay": np.zeros(m),
         "bias": rng.normal(size=(H, n)) * 0.01,
         "target": rng.normal(size=(H + 1, n)) * 0.3,
         "state_weight": rng.uniform(0.5, 2.0, size=(H + 1, n)),
         "input_target": rng.normal(size=(H, m)) * 0.1,
         "input_weight": rng.uniform(0.1, 0.3, size=m),
         "change_weight": rng.uniform(0.1, 0.5, size=m),
-        "low": np.full(m, -np.inf),
-        "high": np.full(m, np.inf),
         "angles": np.array(SPECS[name]["angles"]),
     }
-    fields.update(changes)
-    return Problem(**fields)
+    return plain(sys, p, H, 0.05, **fields | changes)
 
 
 def linear_least_squares(problem: Problem):

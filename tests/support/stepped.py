@@ -75,10 +75,11 @@ def levels(rng: Any, count: int, length: int, size: float = 1.0, m: int = 1) -> 
     return np.repeat(rng.uniform(-size, size, (count, m)), length, axis=0)
 
 
-def slopes(f: Callable[[Any], Any], at: Any, size: float = 1e-6) -> np.ndarray:
+def slopes(f: Callable[[Any], Any], at: Any, size: Any = 1e-6) -> np.ndarray:
     """Return central differences of f by the last axis of `at`, as the last axis."""
-    nudges = size * np.eye(np.shape(at)[-1])
-    return np.stack([(f(at + d) - f(at - d)) / (2 * size) for d in nudges], axis=-1)
+    sizes = np.broadcast_to(size, np.shape(at)[-1:])
+    steps = zip(np.diag(sizes), sizes, strict=True)
+    return np.stack([(f(at + d) - f(at - d)) / (2 * h) for d, h in steps], axis=-1)
 
 
 def library(*names: str) -> Library:

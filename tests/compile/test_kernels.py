@@ -1,20 +1,22 @@
-"""Compiled kernels against their interpreted twins: rollouts, sweeps, whole solves."""
+"""Compiled kernels against interpreted twins: rollouts, sweeps, whole solves, the loop of DDP."""
 
 import threading
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.linalg import solve_discrete_are
 
-from grounded.compile import Problem, system_of
+from grounded.compile import DescentOptions, system_of
 from grounded.compile.kernel_words import MAX_INPUTS
+from grounded.compile.problem import Controls
 from grounded.compile.run.compiled import Kernels
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
 from grounded.compile.trace.tracing import Signature, Variant, trace
 from grounded.engine import Engine, each, running
-from grounded.solve.ddp import solve
-from problems import SPECS, problem
+from grounded.solve.ddp import descended, solve
+from problems import SPECS, plain, problem
 
 TIGHT = {"rtol": 1e-10, "atol": 1e-10}
 
@@ -29,13 +31,8 @@ def pair(name, horizon=37, **changes):
     return problem(name, horizon, **changes), problem(name, horizon, make=traced, **changes)
 
 
-def cases():
-    for name in sorted(SPECS):
-        for delay, limit in ((0.4, np.inf), (2.7, 0.2)):
-            yield name, delay, limit
-
-
-@pytest.mark.parametrize(("name", "delay", "limit"), list(cases()))
+@pytest.mark.parametrize(("delay", "limit"), [(0.4, np.inf), (2.7, 0.2)])
+@pytest.mark.parametrize("name", sorted(SPECS))
 def test_rollout_sweep_and_solve_agree(name, delay, limit):
     m = len(SPECS[name]["inputs"])
     changes = {
@@ -98,12 +95,10 @@ def test_step_kind_and_many_sizes():
             assert mine.shape == theirs.shape and np.allclose(mine, theirs, **TIGHT)
 
 
-def wide(n, m, dense, make=system_of, limits=0.3):
+def wide(n, m, make=system_of):
     """A random stable network of n states and m inputs as a problem of 12 steps."""
     rng = np.random.default_rng(n)
     A = rng.normal(size=(n, n)) / n
-    if not dense:
-        A *= np.abs(np.subtract.outer(np.arange(n), np.arange(n))) <= 1
     B = rng.normal(size=(n, m))
     states, inputs = [f"x{i}" for i in range(n)], [f"u{j}" for j in range(m)]
 
@@ -111,40 +106,17 @@ def wide(n, m, dense, make=system_of, limits=0.3):
         x, u = np.array([s[k] for k in states]), np.array([a[k] for k in inputs])
         return dict(zip(states, A @ np.sin(x) - p.c * x + B @ u, strict=True))
 
-    H, system = (
-        12,
-        make(
-            network,
-            kind="derivative",
-            states=states,
-            inputs=inputs,
-            params=("c",),
-            integrator="rk4",
-        ),
-    )
-    return Problem(
-        system,
-        p=np.array([0.5]),
-        dt=0.1,
-        start=rng.normal(size=n),
-        past=np.zeros(m),
-        delay=rng.uniform(0, 1.5, m),
-        bias=np.zeros((H, n)),
-        target=np.zeros((H + 1, n)),
-        state_weight=np.ones((H + 1, n)),
-        input_target=np.zeros((H, m)),
-        input_weight=np.ones(m),
-        change_weight=np.ones(m),
-        low=np.full(m, -limits),
-        high=np.full(m, limits),
-        angles=np.zeros(n, bool),
-    )
+    names = {"states": states, "inputs": inputs, "params": ("c",)}
+    system = make(network, kind="derivative", integrator="rk4", **names)
+    start, delay = rng.normal(size=n), rng.uniform(0, 1.5, m)
+    bounds = {"low": np.full(m, -0.3), "high": np.full(m, 0.3)}
+    return plain(system, np.array([0.5]), 12, 0.1, start=start, delay=delay, **bounds)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("n", "m", "dense"), [(1, 1, True), (6, 9, True)])
-def test_sizes_written_out_and_looped(n, m, dense):
-    fast, slow = wide(n, m, dense), wide(n, m, dense, traced)
+@pytest.mark.parametrize(("n", "m"), [(1, 1), (6, 9)])
+def test_sizes_written_out_and_looped(n, m):
+    fast, slow = wide(n, m), wide(n, m, traced)
     assert fast.system.how == "compiled"
     u = np.zeros((12, m))
     run = slow.system.rollout(slow, u)
@@ -265,3 +237,56 @@ def test_a_failed_sweep_names_the_same_step():
         bad[4] = np.nan
         found = task.system.backward(replace(task, state_weight=weight), bad, u, np.ones(1))
         assert found.failed_at >= 0
+
+
+def swing_up(H):
+    weight = np.zeros((H + 1, 2))
+    weight[-1] = 100.0
+    return problem(
+        "pendulum", H, start=np.zeros(2), bias=np.zeros((H, 2)),
+        target=np.tile([np.pi, 0.0], (H + 1, 1)), state_weight=weight,
+        input_target=np.zeros((H, 1)), input_weight=np.array([0.01]),
+        change_weight=np.array([0.001]), low=np.array([-2.0]), high=np.array([2.0]),
+    )  # fmt: skip
+
+
+def car():
+    return problem("car", 60, delay=np.array([1.3, 0.0]))
+
+
+@pytest.mark.parametrize("halvings", [0, 2, 11])
+def test_the_compiled_loop_takes_the_decisions_of_the_loop_in_numpy(halvings):
+    """Bit for bit: shorter steps, failed searches, a growing mu, the end of the iterations."""
+    seen = set()
+    tasks = (swing_up(60), 0.5, 100), (swing_up(200), 3.0, 20), (car(), 0.9, 100)
+    for task, u0, most in tasks:
+        H, m = task.horizon, task.system.m
+        u = u0 * np.cos(np.arange(H * m) * 0.1).reshape(H, m)
+        options = DescentOptions(max_iterations=most, halvings=halvings, accept=0.3)
+        fast = task.system.descend(task, Controls(u), options)
+        slow = descended(task, Controls(u), options)
+        assert (fast.status, fast.cost, fast.failed_at) == (slow.status, slow.cost, slow.failed_at)
+        for one in ("lines", "z", "u", "k", "K"):
+            assert np.array_equal(getattr(fast, one), getattr(slow, one)), one
+        seen |= set(slow.lines[:, 2]) | {slow.status}
+    assert {0.0, 1.0, "converged", "max iterations"} < seen
+    assert halvings == 0 or 0.5 in seen
+
+
+def test_a_sweep_of_an_unstable_model_stays_symmetric_over_a_long_horizon():
+    """What rounding leaves unsymmetric grows where the model is faster than its control."""
+    rates, H, dt = np.array([[3.0, 1.0], [0.0, -0.1]]), 6000, 0.02
+
+    def rate(s, a, p):
+        x = np.array([s["x0"], s["x1"]])
+        return dict(zip(("x0", "x1"), rates @ x + np.array([1.0, 1e-3]) * a["u"], strict=True))
+
+    names = {"states": ("x0", "x1"), "inputs": ("u",), "params": ()}
+    system = system_of(rate, kind="derivative", integrator="euler", **names)
+    task = plain(system, np.zeros(0), H, dt, start=np.ones(2), change_weight=np.zeros(1))
+    found = system.backward(task, np.zeros((H + 1, 3)), np.zeros((H, 1)), np.zeros(1))
+    assert found.failed_at == -1
+    A, B = np.eye(2) + dt * rates, dt * np.array([[1.0], [1e-3]])
+    V = solve_discrete_are(A, B, np.eye(2), np.eye(1))
+    K = -np.linalg.solve(np.eye(1) + B.T @ V @ B, B.T @ V @ A)
+    assert np.allclose(found.K[0, :, :2], K, rtol=1e-7)
