@@ -35,7 +35,7 @@ def placed(w, tmp_path, ran, off):
 
 def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(w, tmp_path, monkeypatch):
     ran, *_ = read_trial(run(w))
-    monkeypatch.setattr(gone_wrong, "_changes", lambda *_: 0.9 * w.task.utility(ran))
+    monkeypatch.setattr(gone_wrong, "worth_of_start", lambda *_: 0.9 * w.task.utility(ran))
     assert of_code(placed(w, tmp_path, ran, 0.15), "run.start_spoils")
     for off in (-0.13, 0.11):
         set_aside(w, "discard", [placed(w, tmp_path, ran, off).trial], "")
@@ -57,10 +57,10 @@ def test_a_run_that_is_better_from_either_start_counts(w, monkeypatch, share, co
     worse, better = (read_trial(file)[0] for file in (worse, run(w)))
     utility = w.task.utility(better)
     assert utility > w.task.utility(worse)
-    monkeypatch.setattr(gone_wrong, "_changes", lambda *_: share * utility)
+    monkeypatch.setattr(gone_wrong, "worth_of_start", lambda *_: share * utility)
     moved = np.array(better.states)
     moved[0, 0] += 0.01
-    assert gone_wrong.begun_elsewhere(w, replace(better, states=moved)).code == code
+    assert gone_wrong.Run(w, replace(better, states=moved)).begun_elsewhere().code == code
 
 
 def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(w, tmp_path):

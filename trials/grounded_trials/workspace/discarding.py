@@ -13,7 +13,6 @@ from dataclasses import dataclass, field, replace
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding
 from grounded.result import UNSAID, Document
-from grounded.trial import interpolate_gaps
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -83,20 +82,15 @@ def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
 
 def _instead(workspace: Folder, name: str) -> NextCommand | None:
     """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.gone_wrong import went_as_planned  # slow to load
-    from grounded_trials.workspace.intake.log_faults import log_faults
+    from grounded_trials.workspace.intake.gone_wrong import Run  # slow to load
 
     stored = workspace.store.find(name)
     trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
     if not workspace.fits(trial):
         return None
-    whole = interpolate_gaps(trial).trial
     if "source" in meta and (
         read_otherwise(meta, workspace.log_mapping)
-        or (
-            not went_as_planned(workspace, whole)
-            and any(one.code in COLUMNS for one in log_faults(workspace, whole))
-        )
+        or any(one.code in COLUMNS for one in Run(workspace, trial).log_faults())
     ):
         own = standing_in(workspace).outstanding if trial.candidate else None
         waits = own is not None and own.id == trial.candidate

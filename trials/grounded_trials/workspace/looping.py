@@ -22,7 +22,7 @@ from grounded_trials.workspace.candidates.proposing import Proposed, Status, pro
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.intake.gone_wrong import went_as_planned
+from grounded_trials.workspace.intake.gone_wrong import Run
 from grounded_trials.workspace.intake.ingest import Ingested, ingest_log
 from grounded_trials.workspace.next_step import exported_as
 
@@ -101,11 +101,7 @@ def learn_in(
 def _odd_before(workspace: Folder) -> bool:
     """Return whether the last run's log had faults too, so that the user has chosen to go on."""
     runs = [trial for trial in workspace.task_trials() if trial.candidate]
-    if not runs or went_as_planned(workspace, runs[-1]):
-        return False
-    from grounded_trials.workspace.intake.log_faults import log_faults  # slow to load
-
-    return bool(log_faults(workspace, runs[-1]))
+    return bool(runs and Run(workspace, runs[-1]).log_faults())
 
 
 def next_in(

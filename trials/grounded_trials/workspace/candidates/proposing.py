@@ -372,11 +372,12 @@ def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding | None]:
     if last.stored.digest in workspace.noted.asked:
         yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
         return
-    from grounded_trials.workspace.intake.gone_wrong import shown_by  # slow
+    from grounded_trials.workspace.intake.gone_wrong import Run  # slow
 
     history = standing_in(workspace).history
     tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)
-    yield from shown_by(workspace, last.measured, tried, history, own="source" not in last.meta)
+    run = Run(workspace, last.measured, tried, history)
+    yield from run.shown(own="source" not in last.meta)
 
 
 def _decided(workspace: Folder, last: StoredTrial) -> bool:

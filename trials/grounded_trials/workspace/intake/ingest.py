@@ -23,10 +23,10 @@ from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import NULL, UNSAID, Document, with_unit
-from grounded.search.candidate import Candidate, Tried
-from grounded.search.standing import Phase, Standing
+from grounded.search.candidate import Candidate
+from grounded.search.standing import Phase
 from grounded.task import Task
-from grounded.trial import HUGE, Trial, interpolate_gaps
+from grounded.trial import HUGE, Trial
 from grounded_trials.store.own_files import CANDIDATE, TRIAL, format_of
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
@@ -38,7 +38,7 @@ from grounded_trials.workspace.candidates.search_state import (
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake import COLUMNS
-from grounded_trials.workspace.intake.gone_wrong import shown_by
+from grounded_trials.workspace.intake.gone_wrong import Run
 from grounded_trials.workspace.intake.opening.reading import (
     NoneWaits,
     Read,
@@ -170,27 +170,55 @@ def _as_logged(workspace: Folder, read: Read) -> bool:
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
-    """Return the result for a trial that was just stored: findings, verdict, next command."""
+    """Return the result for a trial that was just stored: findings, verdict, next command.
+
+    Args:
+        workspace: the workspace with the task and the candidates.
+        read: how it was read.
+        added: its file in the store.
+        before: the trial that it repeats to the last bit, or "".
+        ahead: plan the next candidate if the next command depends on it.
+    """
     trial = replace(read.trial, id=added.id)
     now = standing_in(workspace) if trial.candidate else None
-    run = (t for t in now.history if t.candidate.id == trial.candidate) if now else iter(())
-    stored = Stored(workspace, read, added.id, trial, now, next(run, None), before)
-    told = settle(one for one in stored.told() if one)
-    verdict = stored.verdict
-    if ahead and verdict == "run again":
-        now = standing_in(workspace, ahead=True)
-    if (why := read.to_set_aside) and not stored.aside:  # `status` can't tell it from the trial
+    history = now.history if now else ()
+    tried = next((t for t in history if t.candidate.id == trial.candidate), None)
+    run, aside = Run(workspace, trial, tried, history), added.id in workspace.discarded()
+    waiting = now and now.phase is Phase.AWAIT and now.outstanding
+    waits = waiting.id if waiting else ""
+
+    # what is to be known of the log, the search, the columns and the run
+    told = [*read.findings]
+    if before:
+        told.append(found("log.repeats", before, copy=others_differ(workspace)))
+    if aside:
+        told.append(found("log.aside", added.id, waits=waits))
+    if was := read.before:
+        ran = was.trial.candidate or "data"
+        told.append(found("log.before", was.stored.id, ran=ran, used=not aside))
+    if now and (changed := overtaken(workspace, ran=True)):
+        told.append(changed.weighing(Weight.WARN))
+    told += _checked(run, read.last_s)
+    shown = run.shown(own=read.own, doubted=read.doubted, silent=read.silent)
+    findings = settle([*told, *filter(None, shown)])
+
+    # `status` can't tell from the trial alone that it was taken against its commands
+    if (why := read.to_set_aside) and not aside:
         note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": why.code}
         with suppress(GroundedError):  # a folder that can't be written
             workspace.notes.add(note, again=False)
         vars(workspace).pop("noted", None)
-    if any(one.weight is Weight.ASIDE for one in told) and not stored.aside:
+
+    verdict = ASIDE if aside else _verdict(run)
+    if ahead and verdict == "run again":
+        now = standing_in(workspace, ahead=True)
+    if not aside and any(one.weight is Weight.ASIDE for one in findings):
         then = NextCommand("discard", (added.id,))
-    elif now and stored.aside and stored.waits:
+    elif now and aside and waits:
         then = Situation(workspace, now).run
     else:
         then = after_log(workspace, verdict, now)
-    tried, judged = stored.tried, [interpolate_gaps(trial).trial] * bool(trial.candidate)
+    judged = [run.whole] * bool(trial.candidate)
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
@@ -198,7 +226,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         candidate=trial.candidate,
         utility=workspace.task.utility(judged[0]) if judged else None,
         accepted=tried.accepted if tried else None,
-        findings=told,
+        findings=findings,
         signals=read.signals,
         verdict=verdict,
         mean=tried.utility if tried else math.nan,
@@ -209,118 +237,52 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     )
 
 
-@dataclass(frozen=True, eq=False)
-class Stored:
-    """A trial that was just stored, and the search that has it.
-
-    Args:
-        workspace: the workspace with the task and the candidates.
-        read: how it was read.
-        id: its name.
-        trial: the same trial, with that name.
-        now: the standing of the search; None for data.
-        tried: its candidate with all of its runs; None for data, or of another task.
-        before: the trial that it repeats to the last bit, or "".
-    """
-
-    workspace: Folder
-    read: Read
-    id: str
-    trial: Trial
-    now: Standing | None
-    tried: Tried | None
-    before: str
-
-    @property
-    def aside(self) -> bool:
-        """Whether it is set aside."""
-        return self.id in self.workspace.discarded()
-
-    @property
-    def waits(self) -> str:
-        """The candidate that waits for a trial, or ""."""
-        waiting = self.now and self.now.phase is Phase.AWAIT and self.now.outstanding
-        return waiting.id if waiting else ""
-
-    def told(self) -> Iterator[Finding | None]:
-        """Yield what is to be known: of the log, the search, the columns and the run."""
-        here, read, trial = self.workspace, self.read, self.trial
-        yield from read.findings
-        if self.before:
-            yield found("log.repeats", self.before, copy=others_differ(here))
-        if self.aside:
-            yield found("log.aside", self.id, waits=self.waits)
-        if was := read.before:
-            ran = was.trial.candidate or "data"
-            yield found("log.before", was.stored.id, ran=ran, used=not self.aside)
-        if self.now and (changed := overtaken(here, ran=True)):
-            yield changed.weighing(Weight.WARN)
-        yield from _checked(here, trial, read.last_s)
-        history = self.now.history if self.now else ()
-        yield from shown_by(
-            here,
-            trial,
-            self.tried,
-            history,
-            own=read.own,
-            doubted=read.doubted,
-            silent=read.silent,
-        )
-
-    @property
-    def verdict(self) -> str:
-        """The verdict on the run; "run again" for another one of what was the best before it."""
-        tried, repeats = self.tried, self.workspace.config.search.repeats
-        if self.aside:
-            return ASIDE
-        if tried is None:
-            return "probe" if self.trial.candidate else ""
-        first = [one.id for one in tried.trials[:repeats]]
-        if self.id in first or tried.accepted is None or tried.crashed:
-            return tried.verdict()
-        before = standing_of(self.workspace, self.workspace.read(), {self.id})
-        if tried.accepted:
-            was = any(t.accepted for t in before.history if t.candidate.id == tried.candidate.id)
-        else:
-            best = before.incumbent
-            was = best is not None and best.candidate.id == tried.candidate.id
-        return "run again" if was else tried.verdict()
+def _verdict(run: Run) -> str:
+    """Return the verdict on a run; "run again" for another one of what was the best before it."""
+    tried, workspace, own = run.tried, run.workspace, run.trial.id
+    if tried is None:
+        return "probe" if run.trial.candidate else ""
+    first = [one.id for one in tried.trials[: workspace.config.search.repeats]]
+    if own in first or tried.accepted is None or tried.crashed:
+        return tried.verdict()
+    before, ran = standing_of(workspace, workspace.read(), {own}), tried.candidate.id
+    if tried.accepted:
+        was = any(t.accepted for t in before.history if t.candidate.id == ran)
+    else:
+        was = before.incumbent is not None and before.incumbent.candidate.id == ran
+    return "run again" if was else tried.verdict()
 
 
 # --- what a trial lacks or exceeds ---------------------------------------------------------------
 
 
-def _checked(workspace: Folder, trial: Trial, last_s: float = math.nan) -> Iterator[Finding]:
-    """Yield what is to be known of a trial.
+def _checked(run: Run, last_s: float = math.nan) -> Iterator[Finding]:
+    """Yield what a trial lacks or exceeds.
 
     Args:
-        workspace: the workspace with the task and the candidates.
-        trial: the trial as stored.
+        run: the trial as stored.
         last_s: when the last of its states was logged, in seconds of the run; NaN if all are on the
             control grid.
     """
-    task, filled = workspace.task, interpolate_gaps(trial)
-    whole = filled.trial
+    task, whole, filled = run.workspace.task, run.whole, run.bridged
     if filled.samples:
         longest, at = Quantity(filled.longest_s, "s"), Quantity(filled.at_s, "s")
         yield found("log.gaps", filled.state, samples=filled.samples, longest=longest, at=at)
     if whole.finite_steps < whole.steps:
         name, step = _first_bad(whole)
-        ends = Quantity(step * trial.dt, "s") if step else "its start"
+        ends = Quantity(step * whole.dt, "s") if step else "its start"
         yield found("file.vanished", name, ends=ends)
-    if not trial.candidate:
+    if not whole.candidate:
         yield from _still(whole)
-        yield from _beyond(workspace, whole)
+        yield from _beyond(run.workspace, whole)
         return
     if whole.steps < task.horizon and whole.whole(task.horizon) is not whole:
         missing = max(0.0, np.nan_to_num(1e3 * (task.horizon * task.dt - last_s)))
         yield found("log.short", steps=whole.steps, horizon=task.horizon, missing=missing)
-    whole = whole.until(task.horizon)
-    yield from _beyond(workspace, whole)
-    candidate, _ = workspace.candidate(trial.candidate)
-    if np.ptp(candidate.predicted_states, axis=0).any():
-        yield from _still(whole)
-    yield from _unsafe(task, whole, candidate)
+    yield from _beyond(run.workspace, run.run)
+    if np.ptp(run.own.predicted_states, axis=0).any():
+        yield from _still(run.run)
+    yield from _unsafe(task, run.run, run.own)
 
 
 def _first_bad(trial: Trial) -> tuple[str, int]:

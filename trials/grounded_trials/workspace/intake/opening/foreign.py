@@ -384,10 +384,8 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
             *grid.findings,
             *(() if candidate else begun(grid, trial.dt, trial.input_names)),
         ),
-        grid.reports,
         log=log,
         cut=grid,
-        last_s=(grid.last_ns - grid.start_ns) * 1e-9,
     )
 
 

@@ -45,14 +45,12 @@ class Read:
     trial: Trial
     data: bytes
     findings: tuple[Finding, ...] = ()
-    signals: tuple[SignalReport, ...] = ()
     bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
     # the trial that was made from the log before and is set aside
     before: StoredTrial | None = None
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
-    last_s: float = math.nan  # when all states of a foreign log were last known [s from the start]
 
     def telling(self, *findings: Finding) -> Read:
         """Return it with further findings."""
@@ -62,6 +60,16 @@ class Read:
     def own(self) -> bool:
         """Whether it was written by grounded, in the model's units, and not read through [log]."""
         return self.log is None
+
+    @property
+    def signals(self) -> tuple[SignalReport, ...]:
+        """The signals of a foreign log."""
+        return self.cut.reports if self.cut else ()
+
+    @property
+    def last_s(self) -> float:
+        """When all states of a foreign log were last known [s from the start]; else NaN."""
+        return 1e-9 * (self.cut.last_ns - self.cut.start_ns) if self.cut else math.nan
 
     @property
     def to_set_aside(self) -> Finding | None:

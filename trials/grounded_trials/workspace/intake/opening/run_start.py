@@ -227,12 +227,13 @@ class Recording:
         usual = acted_on(self, policy, found.seconds if found else first)
         if usual is not None and usual.exact:
             return None
-        tried = [first - k * self.dt for k in range(1, MISSED + 1)]
-        k = int(np.argmin(self._misfits(policy, tried)))
-        there, least = acted_on(self, policy, tried[k]), UNLIKE * (usual.left if usual else 0.0)
+        misfits = [self._misfit(policy, first - k * self.dt) for k in range(1, MISSED + 1)]
+        missed = int(np.argmin(misfits)) + 1
+        at = first - missed * self.dt
+        there, least = acted_on(self, policy, at), UNLIKE * (usual.left if usual else 0.0)
         if there is None or there.told.sum() < STEPS_TO_JUDGE or there.left > max(least, TO_DIGITS):
             return None
-        return Start(tried[k], found.apart if found else np.inf, True, True, missed=k + 1)
+        return Start(at, found.apart if found else np.inf, True, True, missed=missed)
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
         """Return the likeliest starts, by the difference of the commands from each instant on."""
@@ -269,28 +270,17 @@ class Recording:
         if abs(phase) < dt / 4:
             return start + phase, room
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
-        return tried[int(np.argmin(self._misfits(policy, tried)))], room
+        return min(tried, key=lambda at: self._misfit(policy, at)), room
 
-    def _misfits(self, policy: Policy, starts: Sequence[float]) -> list[float]:
-        """Return the mean difference of the commands from each start on, in units of their size."""
-        found = [self.trial_from(start) for start in starts]
-        trials = {
-            k: one for k, one in enumerate(found) if one and one.finite_steps >= STEPS_TO_JUDGE
-        }
-        misfits = [np.inf] * len(found)
-        if not trials:
-            return misfits
-        lasting = {k: min(one.finite_steps, policy.horizon) for k, one in trials.items()}
-        every = np.zeros((len(trials), max(lasting.values()), len(policy.state_names)))
-        for states, (k, one) in zip(every, trials.items(), strict=True):
-            states[: lasting[k]] = one.states[: lasting[k]]
-        for asked, (k, one) in zip(
-            policy.commands(every, policy.past), trials.items(), strict=True
-        ):
-            sent = np.clip(one.inputs[: lasting[k]], policy.low, policy.high)
-            size = np.abs(sent).max(axis=0) + 1e-12
-            misfits[k] = float((np.abs(asked[: lasting[k]] - sent) / size).mean())
-        return misfits
+    def _misfit(self, policy: Policy, start: float) -> float:
+        """Return the mean difference of the commands from a start on, in units of their size."""
+        trial = self.trial_from(start)
+        if trial is None or trial.finite_steps < STEPS_TO_JUDGE:
+            return np.inf
+        lasting = min(trial.finite_steps, policy.horizon)
+        sent = np.clip(trial.inputs[:lasting], policy.low, policy.high)
+        asked = policy.commands(trial.states[None, :lasting], policy.past)[0]
+        return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
 
     def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
         """Move a start back by less than a row, to where the feedback commands fit best.
