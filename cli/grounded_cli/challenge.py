@@ -11,7 +11,7 @@ from grounded.engine import Engine
 from grounded.errors import NextCommand
 from grounded.refusals import refused
 from grounded_cli.console.terminal import bar, names_in, number, show, table, typed
-from grounded_trials.challenge import diagnose_cases, score_cases, undiagnosed, write_cases
+from grounded_trials.challenge import diagnose_cases, score_cases, write_cases
 from grounded_trials.wording import count
 
 
@@ -39,15 +39,14 @@ def run_cases(
 ) -> Iterator[dict[str, Any]]:
     """Diagnose the cases without a diagnosis."""
     families = [name for text in without for name in names_in(text)]
-    waiting, engine = undiagnosed(Path(folder), again=again), Engine(jobs or 1)
+    engine = Engine(jobs or 1)
     with bar("diagnoses") as progress:
         times = diagnose_cases(
             Path(folder), without=families, again=again, engine=engine, progress=progress
         )
     yield {"cases": list(times), "cpu_s": times}
-    if waiting:
-        mean = sum(times.values()) / max(len(times), 1)
-        show(f"{count(len(waiting), 'case')}: {mean:.1f} s CPU")
+    if times:
+        show(f"{count(len(times), 'case')}: {sum(times.values()) / len(times):.1f} s CPU")
     labels = () if Path(f"{folder}-labels").is_dir() else ("--labels", "DIR")
     show(f"\nnext: {typed(NextCommand('challenge', ('score', folder, *labels)))}")
 

@@ -175,20 +175,11 @@ def diagnose_cases(
     Raises:
         GroundedError: if the folder holds no challenge, or a worker dies.
     """
-    names = undiagnosed(folder, again=again)
+    every = read_manifest(folder)
+    names = [n for n in every if again or not (folder / n / "reports" / DIAGNOSIS).is_file()]
     where = {"folder": str(folder.resolve()), "without": list(without)}
     found = run_jobs(diagnose_case, [where | {"name": n} for n in names], engine, progress)
     return {str(one["case"]): float(one["cpu_s"]) for one in found}
-
-
-def undiagnosed(folder: Path, *, again: bool = False) -> list[str]:
-    """Return the names of the cases without a diagnosis, or with `again` of all cases.
-
-    Raises:
-        GroundedError: if the folder holds no challenge.
-    """
-    names = list(read_manifest(folder))
-    return [n for n in names if again or not (folder / n / "reports" / DIAGNOSIS).is_file()]
 
 
 def diagnose_case(folder: str, name: str, without: Sequence[str]) -> dict[str, Any]:

@@ -63,7 +63,13 @@ def read_document(path: Path) -> dict[str, Any]:
         raise
     except OSError as error:
         raise unreadable(path, error) from None
-    return proven(data, path)
+    found = _SEALED.fullmatch(data)
+    if found is None:
+        raise refused("file.changed", path, what="none")
+    if hashlib.sha256(found[2]).hexdigest() != found[1].decode():
+        raise refused("file.changed", path, what="checksum")
+    document: dict[str, Any] = json.loads(b"{" + found[2])
+    return document
 
 
 def read_as(path: Path, kind: type[D], **facts: Any) -> D | None:
@@ -83,17 +89,6 @@ def read_as(path: Path, kind: type[D], **facts: Any) -> D | None:
         return None
     except (*MALFORMED, GroundedError) as error:
         raise unreadable(path, error, **facts) from None
-
-
-def proven(data: bytes, path: Path) -> dict[str, Any]:
-    """Read a document from the bytes of a file, as `read_document`; `path` is for messages."""
-    found = _SEALED.fullmatch(data)
-    if found is None:
-        raise refused("file.changed", path, what="none")
-    if hashlib.sha256(found[2]).hexdigest() != found[1].decode():
-        raise refused("file.changed", path, what="checksum")
-    document: dict[str, Any] = json.loads(b"{" + found[2])
-    return document
 
 
 class Notes:

@@ -98,9 +98,9 @@ class Store:
             self._listed = names, tuple(sorted(found, key=attrgetter("number", "digest")))
         return self._listed[1]
 
-    def digests(self) -> set[str]:
-        """Return the hashes in the names of all files."""
-        return {entry.digest for entry in self.list()}
+    def holds(self, sha256: str) -> bool:
+        """Return whether a file with this hash is stored."""
+        return any(entry.digest == sha256[:DIGITS] for entry in self.list())
 
     def find(self, key: str) -> Stored:
         """Return the file whose short name or name is `key`.

@@ -350,8 +350,7 @@ class Folder:
         """Yield the search's candidates; a trial's copy replaces a damaged file."""
         ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
-            file = f"candidates/{identity}.mcap"
-            why = unreadable(file, "its file is missing and no trial contains it")
+            file, why = f"candidates/{identity}.mcap", None
             for read in self._sources(identity, trials):
                 try:
                     data = read()
@@ -366,7 +365,9 @@ class Folder:
                     yield made
                 break
             else:
-                errors.append(why)
+                if why is None:
+                    why = unreadable(file, "its file is missing and no trial contains it")
+                    errors.append(why)
                 lost.append(Lost(f"{identity}.mcap", str(why)))
 
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:

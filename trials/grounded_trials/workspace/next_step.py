@@ -14,7 +14,7 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.search.standing import LOST, Ending, Phase, Standing
-from grounded_trials.store.store import DIGITS, hash_file
+from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
@@ -45,7 +45,7 @@ def not_stored(workspace: Folder, candidate: str) -> Path | None:
     """Return the trial file of the last `run` of a candidate if it was not ingested yet."""
     files = [*(workspace.folder / "runs").glob(f"{candidate}-*.mcap")]
     last = max(files, key=lambda path: (len(path.name), path.name), default=None)
-    stored = last is None or hash_file(last)[:DIGITS] in workspace.store.digests()
+    stored = last is None or workspace.store.holds(hash_file(last))
     return None if stored else last
 
 

@@ -249,7 +249,7 @@ class Run:
         task = self.workspace.task
         assert task.safety_low is not None and task.safety_high is not None
         out: NDArray[np.bool_] = (states < task.safety_low) | (states > task.safety_high)
-        return out.any(axis=1)
+        return np.asarray(out.any(axis=1))
 
     def ended_early(self, silent: Sequence[str]) -> Finding | None:
         """Return that it ended early; None if it did not.

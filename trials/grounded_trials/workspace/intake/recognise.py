@@ -42,7 +42,7 @@ from grounded_trials.logs.log_table import misread
 from grounded_trials.wording import with_unit
 from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import other_task
+from grounded_trials.workspace.identity import other_task, sha256
 from grounded_trials.workspace.intake.log_faults import column_faults, not_the_logs
 from grounded_trials.workspace.intake.look import (
     LOOSE,
@@ -55,7 +55,7 @@ from grounded_trials.workspace.intake.opening.foreign import (
     cut_short,
     read_log_file,
 )
-from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read, is_stored
+from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 
 if TYPE_CHECKING:
@@ -108,7 +108,9 @@ class Case:
         self.workspace, self.path, self.task = workspace, path, workspace.task
         self.read, self.ran = read, read.trial.candidate
         self.own, _ = workspace.candidate(self.ran)
-        candidates, self.earlier = _may_have_run(workspace)
+        # what may still be on the robot: of earlier tasks with as many steps as a run of this one
+        candidates, earlier = latest_candidates(workspace, OTHERS)
+        self.earlier = [one for one in earlier if _like_task(one.policy, self.task)]
         self.rivals, self.exact = [*self.earlier, *candidates], False
         self.found: Start | None = None
         # set if judged on other samples than stored
@@ -117,7 +119,7 @@ class Case:
         self.whole = interpolate_gaps(cut).trial
         self.log = log.recording if log else None
         self.guessed = {*self.log.names[0]} - {*self.log.measured} if self.log else set[str]()
-        seen = self._judged(self.rivals)
+        seen = self._judged()
         if self.log and read.log:
             seen = self._located(self.log, read.log, seen)
         elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
@@ -136,10 +138,10 @@ class Case:
         log = self.log
         return cache(lambda one: log.start_of(one.policy) if log else None)
 
-    def _judged(self, others: Sequence[Candidate]) -> Suspicion:
+    def _judged(self) -> Suspicion:
         """Return whose run the one that was cut seems to be by its commands."""
         logged = self.log.measured if self.log else None
-        return suspicion(self.task, self.whole, self.own, others, logged)
+        return suspicion(self.task, self.whole, self.own, self.rivals, logged)
 
     def _located(self, log: Recording, stored: ForeignLog, seen: Suspicion) -> Suspicion:
         """Cut the run where it begins in the log; return whose it is then."""
@@ -148,7 +150,7 @@ class Case:
         self.exact = sender.own is not None and sender.own.exact
         if start and elsewhere(log, start, self.own.policy, why=bool(seen.why)):
             self._cut(stored, start)
-            seen = self._judged(self.rivals)
+            seen = self._judged()
         if sender.sure:
             return replace(seen, why=None, other="")
         if sender.other:
@@ -156,7 +158,7 @@ class Case:
         if start and self.guessed and seen.why and sender.own and sender.own.left < RESEMBLES:
             # a program that differentiates positions has speeds that lag the estimated ones
             self._cut(stored, start)
-            return replace(self._judged(self.rivals), why=None, other="")
+            return replace(self._judged(), why=None, other="")
         return seen
 
     def _cut(self, stored: ForeignLog, start: Start) -> None:
@@ -239,7 +241,9 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         GroundedError: if it is not a run of its candidate, with what it is instead if known.
     """
     ran = read.trial.candidate
-    if not ran or (is_stored(workspace, read.data) and not (read.log and not read.log.stored)):
+    if not ran or (
+        workspace.store.holds(sha256(read.data)) and not (read.log and not read.log.stored)
+    ):
         return read  # a log whose trial is set aside is examined again
     logs = [read.log]
     if read.log and (late := read.log.as_seen):  # its program may have acted on these samples
@@ -414,15 +418,6 @@ def _lasting_s(log: Recording) -> float:
     """Return how long a log lasts after its first command [s]."""
     end = min(int(one.t.max()) for one in log.logged.values())
     return 1e-9 * (end - log.whole.origin_ns) - log.first
-
-
-def _may_have_run(workspace: Folder) -> tuple[list[Candidate], list[Candidate]]:
-    """Return the candidates that may still be on the robot: of the task, and of earlier ones.
-
-    They are the latest ones; those of earlier tasks have as many steps as a run of this one.
-    """
-    latest, earlier = latest_candidates(workspace, OTHERS)
-    return latest, [one for one in earlier if _like_task(one.policy, workspace.task)]
 
 
 def _like_task(policy: Policy, task: Task) -> bool:

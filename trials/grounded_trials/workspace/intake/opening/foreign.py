@@ -170,13 +170,6 @@ class ForeignLog:
         trials = self.workspace.whole_trials()
         return tuple(one for one in trials if one.meta.get(key) == self.source[key])
 
-    def complete(self, series: Mapping[str, Series]) -> Mapping[str, Series]:
-        """Add the estimated states to the signals of this log."""
-        if not self.estimate:
-            return series
-        names = self.workspace.base_model.state_names
-        return {**with_estimates(series, self.estimate, self._estimating, names), **self.own}
-
     @cached_property
     def _estimating(self) -> Task:
         """The task with the model that is used to estimate states."""
@@ -201,8 +194,11 @@ class ForeignLog:
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:
-        """The samples of every state and input."""
-        return self.complete(self.series)
+        """The samples of every state and input, also of estimated states."""
+        if not self.estimate:
+            return self.series
+        names = self.workspace.base_model.state_names
+        return {**with_estimates(self.series, self.estimate, self._estimating, names), **self.own}
 
     @cached_property
     def as_seen(self) -> ForeignLog | None:

@@ -20,7 +20,6 @@ from grounded.trial import Trial
 from grounded.units import same_unit
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
-from grounded_trials.store.store import DIGITS
 from grounded_trials.store.trial_file import read_trial, trial_bytes
 from grounded_trials.workspace.candidates.search_state import none_waits, standing_in
 from grounded_trials.workspace.folder import Folder
@@ -29,7 +28,6 @@ from grounded_trials.workspace.identity import (
     READ_BY,
     StoredTrial,
     other_task,
-    sha256,
 )
 
 if TYPE_CHECKING:
@@ -185,8 +183,3 @@ def encode(workspace: Folder, trial: Trial, facts: dict[str, str], start_ns: int
         input_units=dict(workspace.base_model.inputs),
         start_ns=start_ns,
     )
-
-
-def is_stored(workspace: Folder, data: bytes) -> bool:
-    """Return whether a file is in the store, even if its trial is set aside."""
-    return sha256(data)[:DIGITS] in workspace.store.digests()
