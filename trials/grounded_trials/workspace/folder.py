@@ -168,6 +168,11 @@ class Folder:
         return trials, tuple(lost), errors
 
     @cached_property
+    def _decoded(self) -> dict[str, StoredTrial]:
+        """The trials that were read, by the names of their files."""
+        return {}
+
+    @cached_property
     def _contents(self) -> dict[frozenset[str], Contents]:
         """What was read, by the names of the files."""
         return {}
@@ -340,9 +345,14 @@ class Folder:
         return saved
 
     def _whole(self, stored: Stored) -> StoredTrial:
-        trial, meta, policy = read_trial(self.store.read(stored), stored.path.name)
-        trial = replace(trial, id=stored.id)
-        return StoredTrial(stored, interpolate_gaps(trial).trial, meta, trial, policy)
+        """Return a stored trial; what was read of its file holds, since none is rewritten."""
+        name = stored.path.name
+        if name not in self._decoded:
+            trial, meta, policy = read_trial(self.store.read(stored), name)
+            trial = replace(trial, id=stored.id)
+            bridged = interpolate_gaps(trial).trial
+            self._decoded[name] = StoredTrial(stored, bridged, meta, trial, policy)
+        return self._decoded[name]
 
     def _read_candidates(
         self, trials: tuple[StoredTrial, ...], lost: list[Lost], errors: list[GroundedError]
