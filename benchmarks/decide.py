@@ -88,34 +88,18 @@ def decided(case):
 
 
 def marked(case, names):
-    """Return the marks of some names; what the instruments corrected counts as in the document."""
-    label, true = case["label"], case["oracle"]
-    truth = {e["effect"] for e in label["effects"]}
-    names = {*names, *_corrected(case)}
-    if label["param_error"]:
-        names = {n for n in names if n in truth or not n.startswith("parameter:")}
-    clear = true is not None and all(nats > 3.0 for nats in true.each.values())
-    return {
-        "kind": label["kind"], "clear": clear, "found": truth <= names,
-        "spurious": bool(truth) and len(names | (truth & names)) > len(truth),
-        "false": not truth and bool(names),
-    }  # fmt: skip
-
-
-def _corrected(case):
-    kinds = {"delay": "sensor_delay", "lag": "sensor_lag"}
-    found = [f for f in case["document"].get("preflight", ()) if f["corrected"]]
-    return {f"{kinds[f['kind']]}:{f['signal']}" for f in found if f["kind"] in kinds}
+    """Return the marks of a diagnosis that names these effects."""
+    verdict = case["document"]["verdict"] | {"effects": sorted(names), "parameters": []}
+    return judge(case["label"], case["document"] | {"verdict": verdict}, case["oracle"])
 
 
 def told(marks):
     """Return the figures of some marks in a line."""
-    rows = []
-    for kind in ("single", "double"):
-        rows.append((kind, [m["found"] for m in marks if m["kind"] == kind and m["clear"]]))
-    rows.append(("spurious", [m["spurious"] for m in marks if m["kind"] in ("single", "double")]))
-    for kind in ("none", "withheld"):
-        rows.append((f"named in {kind}", [m["false"] for m in marks if m["kind"] == kind]))
+    clear = [m for m in marks if m.get("each_detectable")]
+    rows = [(kind, [m["both"] for m in clear if m["kind"] == kind]) for kind in KINDS[:2]]
+    rows.append(("spurious", [m["false_second"] for m in marks if m["kind"] in KINDS[:2]]))
+    for kind in KINDS[2:]:
+        rows.append((f"named in {kind}", [m["false_effect"] for m in marks if m["kind"] == kind]))
     words = []
     for name, each in rows:
         found = share(each)

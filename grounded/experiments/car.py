@@ -20,7 +20,7 @@ import numpy as np
 
 from grounded.engine import Engine
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Progress, StudyTable, improvement, mean_text, run_study
+from grounded.experiments.jobs import Progress, StudyTable, improvement, mean_text, run_jobs
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.plant import Plant
@@ -107,10 +107,10 @@ def run(
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
     )
-    return CarResult(run_study(CarRun, car_job, cases, engine, progress))
+    return CarResult(tuple(run_jobs(car_job, cases, engine, progress)))
 
 
-def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
+def car_job(manoeuvre: str, seed: int, noisy: bool) -> CarRun:
     """Run one job: one repetition of one manoeuvre."""
     task, plant, trials = car_task(manoeuvre, car), real_plant(noisy), list[Trial]()
     start = dict(zip(car.state_names, map(float, task.start), strict=True))
@@ -140,6 +140,5 @@ def car_job(manoeuvre: str, seed: int, noisy: bool) -> dict[str, Any]:
         fresh = [task.utility(driven(plant, candidate.policy, 7, i)) for i in runs]
         true.append(float(np.mean(np.maximum(fresh, still))))
     utilities, alphas = tuple(found.standing.utilities), tuple(c.alpha for c in found.candidates)
-    first, last, top = true
-    run = (manoeuvre, seed, noisy, utilities, (first, last), top, len(trials), alphas)
-    return vars(CarRun(*run))
+    run = (manoeuvre, seed, noisy, utilities, (true[0], true[1]), true[2], len(trials), alphas)
+    return CarRun(*run)

@@ -27,7 +27,7 @@ from grounded.experiments.jobs import (
     improvement,
     mean_se,
     mean_text,
-    run_study,
+    run_jobs,
 )
 from grounded.frozen import Array
 from grounded.models.aircraft import model as aircraft
@@ -144,12 +144,12 @@ def run(
             raise wrong("flyable models", len(found), low=count)
         seed = first_seed + len(found)
         cases = ({"seed": s} for s in range(seed, seed + missing))
-        found += run_study(FlightRun, flight_job, cases, engine, progress)
+        found += run_jobs(flight_job, cases, engine, progress)
     _, optimum = first_policy(flight_task(aircraft))
     return FlightResult(tuple(found), -optimum.cost)
 
 
-def flight_job(seed: int) -> dict[str, Any]:
+def flight_job(seed: int) -> FlightRun:
     """Run one job: one approximate model, five iterations."""
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
@@ -159,12 +159,12 @@ def flight_job(seed: int) -> dict[str, Any]:
     flown = None if first is None else real_flight(truth, first)
     if flown is None or unstable(truth, flown):
         claimed = plain([truth.utility(flown)] if flown else [])  # JSON has no infinity
-        return vars(FlightRun(seed, True, claimed, 1, (1.0,)))
+        return FlightRun(seed, True, tuple(claimed), 1, (1.0,))
     fly = partial(real_flight, truth)
     found = learn(task, fly, options, max_iterations=ITERATIONS, check=False)
     alphas = tuple(c.alpha for c in found.candidates)
     utilities = tuple(found.standing.utilities)
-    return vars(FlightRun(seed, False, utilities, len(found.trials), alphas))
+    return FlightRun(seed, False, utilities, len(found.trials), alphas)
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:

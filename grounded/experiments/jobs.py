@@ -1,9 +1,8 @@
 """Studies as independent, seeded jobs, whose results do not depend on the workers.
 
-A job is a call of a module-level function with plain numbers and names; it returns plain JSON
-values. It draws all random numbers from its own seed, so the same seeds give the same results bit
-for bit on one worker or on fifty. `grounded.engine` decides where jobs run; a lost worker ends the
-study.
+A job is a call of a module-level function with plain numbers and names. It draws all random numbers
+from its own seed, so the same seeds give the same results bit for bit on one worker or on fifty.
+`grounded.engine` decides where jobs run; a lost worker ends the study.
 
 The module also has the statistics that studies report: means with standard errors, improvements,
 tables. The improvement of a utility (never positive) from U_0 to U is (U - U_0) / |U_0|, so 0.76
@@ -13,7 +12,6 @@ a ratio of means; both are given.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -27,20 +25,19 @@ from grounded.checks import refused
 from grounded.engine import Engine, processes
 
 Progress = Callable[[int, int], None]  # jobs done, jobs in all
-Arguments = dict[str, Any]
 R = TypeVar("R")
 
 
 def run_jobs(
-    function: Callable[..., dict[str, Any]],
-    cases: Iterable[Arguments],
+    function: Callable[..., R],
+    cases: Iterable[dict[str, Any]],
     engine: Engine | None = None,
     progress: Progress | None = None,
-) -> list[dict[str, Any]]:
+) -> list[R]:
     """Call a module-level function with the arguments of each case; return the results in order.
 
     Args:
-        function: of JSON-like arguments.
+        function: of plain arguments.
         cases: the arguments by name, one job each.
         engine: where the jobs run; None: in this process.
         progress: called with the number of jobs done and the total.
@@ -48,38 +45,21 @@ def run_jobs(
     Raises:
         GroundedError: if a worker dies.
     """
-    rows = [*enumerate(cases)]
-    results, total = dict[int, dict[str, Any]](), len(rows)
+    rows, results = [*enumerate(cases)], dict[int, R]()
     tell = progress or (lambda done, total: None)
-    tell(0, total)
+    tell(0, len(rows))
     try:
         for i, result in processes(engine or Engine(), partial(_call, function), rows):
             results[i] = result
-            tell(len(results), total)
+            tell(len(results), len(rows))
     except BrokenProcessPool as error:
-        undone = total - len(results)
-        raise refused("run.workers", lost=undone, total=total, why=str(error)) from None
-    return [results[i] for i in range(total)]
+        undone = len(rows) - len(results)
+        raise refused("run.workers", lost=undone, total=len(rows), why=str(error)) from None
+    return [results[i] for i in range(len(rows))]
 
 
-def run_study(
-    kind: type[R],
-    function: Callable[..., dict[str, Any]],
-    cases: Iterable[Arguments],
-    engine: Engine | None = None,
-    progress: Progress | None = None,
-) -> tuple[R, ...]:
-    """Return each result of `run_jobs` as a dataclass with its names, JSON lists as tuples."""
-    found = run_jobs(function, cases, engine, progress)
-    tuples = ({k: tuple(v) if isinstance(v, list) else v for k, v in r.items()} for r in found)
-    return tuple(kind(**result) for result in tuples)
-
-
-def _call(
-    function: Callable[..., dict[str, Any]], row: tuple[int, Arguments]
-) -> tuple[int, dict[str, Any]]:
-    # through JSON and back: results are plain values
-    return row[0], json.loads(json.dumps(function(**row[1])))
+def _call(function: Callable[..., R], row: tuple[int, dict[str, Any]]) -> tuple[int, R]:
+    return row[0], function(**row[1])
 
 
 @dataclass(frozen=True)

@@ -40,7 +40,7 @@ import numpy as np
 
 from grounded.compile import Problem
 from grounded.engine import Engine
-from grounded.experiments.jobs import Progress, StudyTable, mean_se, mean_text, run_study
+from grounded.experiments.jobs import Progress, StudyTable, mean_se, mean_text, run_jobs
 from grounded.frozen import Array
 from grounded.model import Model, Param
 from grounded.result import document
@@ -143,7 +143,7 @@ def theorem1(
 ) -> Theorem1Result:
     """Run a search for each epsilon and seed; the seed sets the shape of the model's error."""
     cases = [{"epsilon": float(epsilon), "seed": seed} for epsilon in epsilons for seed in seeds]
-    return Theorem1Result(run_study(Theorem1Row, theorem1_job, cases, engine, progress))
+    return Theorem1Result(tuple(run_jobs(theorem1_job, cases, engine, progress)))
 
 
 def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def theorem1_task(epsilon: float, seed: int) -> Task:
     )
 
 
-def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
+def theorem1_job(epsilon: float, seed: int) -> Theorem1Row:
     """Run one job: one search to its end."""
     task = theorem1_task(epsilon, seed)
     truth = task.with_model(task.model.with_values({"eps": 0.0}))
@@ -199,7 +199,7 @@ def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
         better = _line_search(real, u, -guess, float(swarm.cost[0]))
         if better is None or iterations >= ITERATIONS:
             squared = float((own**2).sum())
-            return vars(Theorem1Row(epsilon, seed, first, squared, K, iterations))
+            return Theorem1Row(epsilon, seed, first, squared, K, iterations)
         u, iterations = better, iterations + 1
 
 

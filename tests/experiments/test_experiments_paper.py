@@ -46,8 +46,8 @@ def test_flight_speaks_the_contract(flown):
 def test_an_unstable_first_controller_is_discarded(monkeypatch):
     monkeypatch.setattr(flight, "RADIUS", 1.0)
     result = flight.flight_job(0)
-    assert result["discarded"] and result["trials"] == 1
-    assert result["utilities"][0] < -5000
+    assert result.discarded and result.trials == 1
+    assert result.utilities[0] < -5000
 
 
 def test_footnote9_is_solved_in_one_iteration():
