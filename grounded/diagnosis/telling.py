@@ -24,7 +24,7 @@ from grounded.diagnosis.error_report import (
     telling,
 )
 from grounded.diagnosis.levels import ABOVE, SHOWS
-from grounded.figures.figure import Figure, Panel, bars, curve, legend, panel
+from grounded.figures.figure import Figure, Panel, bars, curve, panel
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
 from grounded.result import figure, measured, number, or_zero, percent, shown
@@ -300,8 +300,7 @@ def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
     if not panels:
         return None
     caption = "" if errors[0].held_out != "no" else "not held out"
-    key = tuple(sorted(legend(panels), key=lambda one: one.role == "other"))
-    return Figure("accuracy", "Predictions before and after", caption, panels, key)
+    return Figure("accuracy", "Predictions before and after", caption, panels)
 
 
 def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> list[Panel]:

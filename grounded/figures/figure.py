@@ -1,9 +1,9 @@
 """Figures as Plotly's own data: a page, a notebook and a picture draw the same traces.
 
-`curve` and `Dot` make the contents of a `panel`, `bars` one of horizontal bars: traces and a layout
-as Plotly's JSON has them, with arrays in place of lists. Colours are roles ("@best", or
-"@best/0.15" with an opacity), so that a page follows the reader's light or dark mode. No function
-here needs Plotly.
+`curve` and `marks` make the contents of a `panel`, `bars` one of horizontal bars: traces and a
+layout as Plotly's JSON has them, with arrays in place of lists. Whatever has a name is in the
+legend of its figure. Colours are roles ("@best", or "@best/0.15" with an opacity), so that a page
+follows the reader's light or dark mode. No function here needs Plotly.
 """
 
 from __future__ import annotations
@@ -51,18 +51,6 @@ TICKS = 5  # most ticks of a logarithmic axis
 Trace = dict[str, Any]
 
 
-class Dot(NamedTuple):
-    """A point with the text shown on hovering; without a finite y it is on the lower edge."""
-
-    x: float
-    y: float
-    role: str
-    note: str
-    shape: str = "disc"  # one of SYMBOLS
-    error: float = 0.0  # half the height of an error bar
-    trial: str = ""
-
-
 class Key(NamedTuple):
     """An entry of a figure's legend; `trial` is set for the path of a trial of role "other"."""
 
@@ -96,7 +84,24 @@ class Figure:
     title: str
     caption: str
     panels: Sequence[Panel]
-    key: Sequence[Key] = ()
+
+    @property
+    def key(self) -> list[Key]:
+        """The legend: every named trace, rule and band once, those for context last."""
+        found = dict[tuple[str, str], Key]()
+        for one in self.panels:
+            for trace in one.data:
+                (role, trial, style), name = trace["meta"].values(), trace["name"]
+                if name and style != "ghost":
+                    shape = {"points": "disc", "steps": "line"}.get(style, style)
+                    key = Key(role, name, shape, trial if role == "other" else "")
+                    found.setdefault((role, name), key)
+            for shape in one.layout.get("shapes", ()):
+                if name := shape.get("name"):
+                    kind = "line" if shape["type"] == "line" else "band"
+                    role = (shape.get("fillcolor") or shape["line"]["color"])[1:].partition("/")[0]
+                    found.setdefault((role, name), Key(role, name, kind))
+        return sorted(found.values(), key=lambda key: key.role == "other")
 
 
 class Body(Protocol):
@@ -183,10 +188,10 @@ def rule(y: float, role: str, name: str) -> Trace:
     return _across(y, y) | {"type": "line", "line": line, "layer": "above", "name": name}
 
 
-def band(low: float, high: float, role: str) -> Trace:
+def band(low: float, high: float, role: str, name: str) -> Trace:
     """Return a faint horizontal band across the panel."""
     look = {"type": "rect", "fillcolor": f"@{role}/0.15", "line": {"width": 0}, "layer": "below"}
-    return _across(low, high) | look
+    return _across(low, high) | look | {"name": name}
 
 
 def _across(low: float, high: float) -> Trace:
@@ -198,12 +203,51 @@ def _dash(role: str) -> dict[str, str]:
     return {"dash": dash} if dash else {}
 
 
+def marks(
+    x: Sequence[float],
+    y: Sequence[float],
+    role: str,
+    notes: Sequence[str],
+    *,
+    shape: str = "disc",
+    name: str = "",
+    errors: Sequence[float] = (),
+    trial: str = "",
+) -> Trace:
+    """Return marks of one look, with the texts shown on hovering.
+
+    Args:
+        x: positions.
+        y: values; one that is not finite is drawn on the lower edge.
+        role: their colour.
+        notes: a text for each.
+        shape: one of SYMBOLS.
+        name: their name in the legend.
+        errors: half the heights of error bars, () for none.
+        trial: the trial whose marks they are.
+    """
+    size, width = (9, 1.5) if shape in ("disc", "ring") else (11, 2.5)
+    look = {"color": f"@{role}", "line": {"color": f"@{role}", "width": width}}
+    trace: Trace = {
+        "type": "scatter", "mode": "markers", "x": np.array(x, float), "y": np.array(y, float),
+        "text": [note.replace("\n", "<br>") for note in notes], "name": name,
+        "hovertemplate": "%{text}<extra></extra>", "cliponaxis": False,
+        "meta": {"role": role, "trial": trial, "style": shape},
+        "marker": look | {"symbol": SYMBOLS[shape], "size": size},
+    }  # fmt: skip
+    if any(errors):
+        trace["error_y"] = {
+            "type": "data", "array": np.array(errors), "color": f"@{role}", "thickness": 1.2,
+            "width": 0,
+        }  # fmt: skip
+    return trace
+
+
 def panel(
     title: str,
     x_name: str,
     y_name: str,
-    curves: Sequence[Trace],
-    dots: Sequence[Dot] = (),
+    traces: Sequence[Trace],
     shapes: Sequence[Trace] = (),
     *,
     equal: bool = False,
@@ -215,14 +259,13 @@ def panel(
     note: str = "",
     kind: str = "",
 ) -> Panel:
-    """Return axes that contain every named curve, every dot and every rule.
+    """Return axes that contain every named curve, every mark and every rule.
 
     Args:
         title: of the panel.
         x_name: title of the x axis.
         y_name: title of the y axis.
-        curves: made by `curve`.
-        dots: its marks.
+        traces: made by `curve` and `marks`.
         shapes: made by `rule` and `band`.
         equal: equal scales on both axes.
         loss: the y axis shows losses y < 0 by the logarithm of -y, the smallest at the top.
@@ -233,23 +276,25 @@ def panel(
         note: text behind the title.
         kind: see `Panel`.
     """
-    # what must be seen
-    drawn = [one for one in curves if one["meta"]["style"] != "ghost"]
-    drawn = [one for one in drawn if one["name"]] or drawn
-    xs = [one["x"] for one in drawn] + [np.array([dot.x for dot in dots])]
-    lines = [shape["y0"] for shape in shapes if shape["type"] == "line"]
-    ys = [one["y"] for one in drawn] + [np.array([*(dot.y for dot in dots), *lines], float)]
-
     # a loss is drawn as the cost -y; what is no loss is drawn as the smallest
     if loss:
-        least = min((-float(y[y < 0].max()) for y in ys if (y < 0).any()), default=1.0)
-        curves = [one | {"y": np.maximum(-one["y"], least)} for one in curves]
-        dots = [dot._replace(y=max(-dot.y, least)) for dot in dots]
+        losses = [-float(t["y"][t["y"] < 0].max()) for t in traces if (t["y"] < 0).any()]
+        losses += [-one["y0"] for one in shapes if one["type"] == "line" and one["y0"] < 0]
+        least = min(losses, default=1.0)
+        traces = [one | {"y": np.maximum(-one["y"], least)} for one in traces]
         ends = ({end: max(-one[end], least) for end in ("y0", "y1")} for one in shapes)
         shapes = [one | changed for one, changed in zip(shapes, ends, strict=True)]
-        ys = [np.maximum(-y, least) for y in ys]
+
+    # what must be seen: marks, and curves with a name, or all where none has one
+    drawn = [one for one in traces if one["meta"]["style"] != "ghost"]
+    dots = [one for one in drawn if one["meta"]["style"] in SYMBOLS]
+    lines = [one for one in drawn if one["meta"]["style"] not in SYMBOLS]
+    seen = [*([one for one in lines if one["name"]] or lines), *dots]
+    xs = [one["x"] for one in seen]
+    rules = [one["y0"] for one in shapes if one["type"] == "line"]
+    ys = [*(one["y"] for one in seen), np.array(rules, float)]
     if log:
-        curves = [_positive(one) for one in curves]
+        traces = [_positive(one) for one in traces]
 
     # the axes
     margin = 0.06 if equal else 0.03 if dots or kind != "time" else 0.0
@@ -273,15 +318,16 @@ def panel(
     if equal:
         up["scaleanchor"] = "x"
 
-    # the marks, a trace for each look
-    looks: dict[tuple[Any, ...], list[Dot]] = {}
-    for dot in dots:
-        looks.setdefault((dot.role, dot.shape, dot.error > 0, dot.trial), []).append(dot)
-    ends_ = [10.0**low, 10.0**high] if log or loss else [low, high]
-    edge = ends_[1] if loss else ends_[0]
-    data = [*curves, *(_marks(same, edge) for same in looks.values())]
-    layout = {"xaxis": across, "yaxis": up, "shapes": [*shapes]}
-    return Panel(title, data, layout, note, kind)
+    # marks without a value are on the lower edge
+    edge = up["range"][0]
+    edge = 10.0**edge if log or loss else edge
+    data = [
+        one | {"y": np.where(np.isfinite(one["y"]), one["y"], edge)}
+        if one["meta"]["style"] in SYMBOLS
+        else one
+        for one in traces
+    ]
+    return Panel(title, data, {"xaxis": across, "yaxis": up, "shapes": [*shapes]}, note, kind)
 
 
 def _positive(trace: Trace) -> Trace:
@@ -295,25 +341,6 @@ def _axis(name: str, low: float, high: float) -> dict[str, Any]:
         "title": {"text": name, "standoff": 6}, "range": [low, high], "gridcolor": "@grid",
         "zeroline": False, "linecolor": "@grid", "automargin": True,
     }  # fmt: skip
-
-
-def _marks(dots: Sequence[Dot], edge: float) -> Trace:
-    """Return the trace of marks of one look; those without a finite y are on the edge."""
-    one, y = dots[0], np.array([dot.y if np.isfinite(dot.y) else edge for dot in dots])
-    size, width = (9, 1.5) if one.shape in ("disc", "ring") else (11, 2.5)
-    look = {"color": f"@{one.role}", "line": {"color": f"@{one.role}", "width": width}}
-    trace = {
-        "type": "scatter", "mode": "markers", "x": np.array([dot.x for dot in dots]), "y": y,
-        "text": [dot.note.replace("\n", "<br>") for dot in dots], "hovertemplate": "%{text}",
-        "name": "", "meta": {"role": one.role, "trial": one.trial, "style": one.shape},
-        "marker": look | {"symbol": SYMBOLS[one.shape], "size": size}, "cliponaxis": False,
-    }  # fmt: skip
-    if one.error > 0:
-        trace["error_y"] = {
-            "type": "data", "array": np.array([dot.error for dot in dots]),
-            "color": f"@{one.role}", "thickness": 1.2, "width": 0,
-        }  # fmt: skip
-    return trace
 
 
 def bars(title: str, rows: Sequence[tuple[str, float, str, str]]) -> Panel:
@@ -359,23 +386,6 @@ def label_lines(panel: Panel) -> int:
     """Return in how many lines the longest label of bars is broken."""
     labels: Sequence[str] = panel.layout["yaxis"]["ticktext"]
     return max(label.count("<br>") + 1 for label in labels)
-
-
-def legend(panels: Sequence[Panel]) -> tuple[Key, ...]:
-    """Return a legend entry for each named curve and rule of the panels, without duplicates."""
-    found: dict[tuple[str, str], Key] = {}
-    for one in panels:
-        for trace in one.curves:
-            role, style = trace["meta"]["role"], trace["meta"]["style"]
-            if trace["name"] and style != "ghost":
-                shape = "disc" if style == "points" else "line"
-                trial = trace["meta"]["trial"] if role == "other" else ""
-                found.setdefault((role, trace["name"]), Key(role, trace["name"], shape, trial))
-        for shape in one.layout.get("shapes", ()):
-            if name := shape.get("name"):
-                role = shape["line"]["color"][1:]
-                found.setdefault((role, name), Key(role, name))
-    return tuple(found.values())
 
 
 def key_trace(key: Key) -> Trace:

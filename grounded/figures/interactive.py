@@ -87,7 +87,7 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
             made.add_shape(shape, **at)
     keys = {(k.role, k.name): k for figure in figures for k in figure.key if not k.trial}
     for key in keys.values():
-        if all(key.name != name for _, name in named):  # marks have no names of their own
+        if all(key.name != name for _, name in named):  # rules and bands are no traces
             made.add_trace(coloured(key_trace(key)))
 
     total = sum(heights) + SPACE * rows + 80

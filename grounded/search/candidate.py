@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from grounded.figures.figure import Figure, curve, legend, panel
+from grounded.figures.figure import Figure, curve, panel
 from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
@@ -161,7 +161,7 @@ class Candidate(Result):
             title = f"{name} [{unit}]" if unit else name
             panels.append(panel(title, "time [s]", unit, [drawn], kind="time"))
         title = f"{self.id}: predicted utility {figure(self.predicted_utility)}"
-        return (Figure("candidate", title, "", panels, legend(panels[:1])),)
+        return (Figure("candidate", title, "", panels),)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.figures.figure import Dot, Figure, Key, Panel, Trace, band, curve, panel
+from grounded.figures.figure import Figure, Panel, Trace, band, curve, marks, panel
 from grounded.result import figure
 from grounded.search.candidate import Tried
 
@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 STEEP = 8.0  # ratio of worst to best utility from which on the axis is logarithmic
 MOST_DRAWN = 300  # most candidates that are drawn
 TICKS = 8  # most candidates named on an axis
+PREDICTED = ("predicted", "dash", "predicted by the model")  # role, shape and name of its marks
 OPEN = ("waiting", "in doubt", "no trial")  # undecided verdicts
 
 
@@ -29,19 +30,6 @@ def search_figure(now: Standing) -> Figure | None:
         return None
     number = {t.candidate.id: k + 1 for k, t in enumerate(now.history)}
     waits = [t for t in shown if not t.utilities and now.verdict(t) == "waiting"]
-    whole = _utility(now, tried + waits, number)
-    unsure = any(now.verdict(t) == "maybe better" for t in shown)
-    key = [
-        Key("best", f"first{', maybe better' * unsure} or better", "disc"),
-        Key("other", "no better", "ring"),
-        *[Key("predicted", "undecided", "ring")] * any(now.verdict(t) in OPEN for t in shown),
-        Key("predicted", "predicted by the model", "dash"),
-        Key("best", "best so far"),
-    ]
-    if any(not math.isfinite(t.utility) for t in tried):
-        key.append(Key("model", "crashed", "cross"))
-    if any(shape["type"] == "rect" for shape in whole.layout["shapes"]):
-        key.append(Key("other", "±2 standard errors of the best", "band"))
     stepped = any(t.candidate.grounded for t in shown)
     caption = (
         "Each candidate is run on the real system; it becomes the best so far if its utility, the "
@@ -49,7 +37,7 @@ def search_figure(now: Standing) -> Figure | None:
         + "; for all but the first candidate, it replays an earlier trial" * stepped
         + "."
     ) + f" {left} candidates in between are not drawn." * bool(left)
-    return Figure("utility", "Utility", caption, (whole,), tuple(key))
+    return Figure("utility", "Utility", caption, (_utility(now, tried + waits, number),))
 
 
 def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
@@ -71,20 +59,19 @@ def few(history: Sequence[Tried], most: int) -> tuple[list[Tried], int]:
 
 
 def _utility(now: Standing, tried: list[Tried], number: dict[str, int]) -> Panel:
-    dots = [d for t in tried for d in _dots(t, number[t.candidate.id], now.verdict(t))]
-    shapes = list[Trace]()
-    values = [d.y for d in dots if math.isfinite(d.y)]
-    best = now.incumbent
+    shapes, best = list[Trace](), now.incumbent
     if best is not None and 0 < best.standard_error < math.inf:
         error = 2 * best.standard_error
-        shapes.append(band(best.utility - error, best.utility + error, "other"))
+        ends = best.utility - error, best.utility + error
+        shapes.append(band(*ends, "other", "±2 standard errors of the best"))
+    dots = _marks(now, tried, number)
+    values = [float(y) for one in dots for y in one["y"] if math.isfinite(y)]
     loss = bool(values) and max(values) < 0 and min(values) < STEEP * max(values)
     return panel(
         "Utility of each candidate" + (", logarithmic" if loss else ""),
         "candidate",
         "utility",
-        _record(now.history, number),
-        dots,
+        [*_record(now.history, number), *dots],
         shapes,
         x_ticks=_named(now.history, number),
         loss=loss,
@@ -92,26 +79,46 @@ def _utility(now: Standing, tried: list[Tried], number: dict[str, int]) -> Panel
     )
 
 
-def _dots(tried: Tried, at: int, became: str) -> list[Dot]:
+def _marks(now: Standing, tried: Sequence[Tried], number: dict[str, int]) -> list[Trace]:
+    """Return the marks of what was predicted of each candidate, and of its runs by verdict."""
+    looks: dict[tuple[str, str, str], list[Tried]] = {PREDICTED: []}
+    for one in tried:
+        if math.isfinite(one.promised) and not (one.utilities and one.utility == -math.inf):
+            looks[PREDICTED].append(one)
+        if one.utilities:
+            looks.setdefault(_look(one, now.verdict(one)), []).append(one)
+    found = []
+    for (role, shape, name), some in looks.items():
+        real, at = shape != PREDICTED[1], [number[one.candidate.id] for one in some]
+        spreads = [one.standard_error for one in some]
+        errors = [e if real and math.isfinite(e) else 0.0 for e in spreads]
+        values = [one.utility if real else one.promised for one in some]
+        notes = [_note(one, now.verdict(one)) for one in some]
+        found.append(marks(at, values, role, notes, shape=shape, name=name, errors=errors))
+    return [one for one in found if len(one["x"])]
+
+
+def _note(tried: Tried, became: str) -> str:
+    """Return what is shown of a candidate on hovering."""
     candidate = tried.candidate
-    real = figure(tried.utility)
     note = (
         f"{candidate.id}, iteration {candidate.iteration}, α = {candidate.alpha:g}\n"
-        f"utility {real}, predicted {figure(tried.promised)}\n{became}"
+        f"utility {figure(tried.utility)}, predicted {figure(tried.promised)}\n{became}"
     )
-    expected = Dot(at, tried.promised, "predicted", note, "dash")
-    if not tried.utilities:
-        return [expected] if math.isfinite(tried.promised) else []
-    error = tried.standard_error
-    if math.isfinite(error):
+    if math.isfinite(error := tried.standard_error):
         note += f", ± {figure(error, 2)} over {len(tried.trials)} trials"
+    return note
+
+
+def _look(tried: Tried, verdict: str) -> tuple[str, str, str]:
+    """Return role, shape and name of the mark of a candidate's runs."""
     if not math.isfinite(tried.utility):
-        return [Dot(at, math.nan, "model", f"{note}: the run failed", "cross")]
-    shape, role = _look(tried, became)
-    dots = [Dot(at, tried.utility, role, note, shape, error if math.isfinite(error) else 0.0)]
-    if math.isfinite(tried.promised):
-        dots.insert(0, expected._replace(note=note))
-    return dots
+        return "model", "cross", "crashed"
+    if verdict in OPEN:
+        return "predicted", "ring", "undecided"
+    if tried.accepted:
+        return "best", "disc", "first or better"
+    return "other", "ring", "no better"
 
 
 def _record(tried: Sequence[Tried], number: dict[str, int]) -> list[Trace]:
@@ -125,17 +132,10 @@ def _record(tried: Sequence[Tried], number: dict[str, int]) -> list[Trace]:
         return []
     at, values = np.array(steps).T
     x = np.append(np.repeat(at, 2)[1:], float(max(number.values())))
-    return [curve(x, np.repeat(values, 2), "best", "", 1.2)]
+    return [curve(x, np.repeat(values, 2), "best", "best so far", 1.2)]
 
 
 def _named(shown: Sequence[Tried], number: dict[str, int]) -> tuple[tuple[float, str], ...]:
     """Return the candidate ids on the axis, evenly thinned to at most TICKS."""
     kept = shown[:: -(-len(shown) // TICKS)]
     return tuple((float(number[t.candidate.id]), t.candidate.id) for t in kept)
-
-
-def _look(tried: Tried, verdict: str) -> tuple[str, str]:
-    """Return (shape, role) of a candidate's mark."""
-    if verdict in OPEN:
-        return "ring", "predicted"
-    return ("disc", "best") if tried.accepted else ("ring", "other")

@@ -14,7 +14,7 @@ from grounded.diagnosis.error_report import Credit, RulerRow
 from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.diagnosis.telling import accuracy_figure, credit_figure
 from grounded.experiments.pendulum import pendulum_task
-from grounded.figures.figure import Dot, Figure, curve, log_ticks, panel, rule
+from grounded.figures.figure import Figure, curve, log_ticks, marks, panel, rule
 from grounded.model import Model
 from grounded.models import pendulum
 from grounded.rollout import simulate
@@ -128,12 +128,8 @@ def test_logarithmic_panels_show_what_has_a_logarithm():
 
 
 def test_a_loss_is_drawn_by_its_cost_with_the_smallest_on_top():
-    dots = [
-        Dot(1, -100.0, "best", "a"),
-        Dot(2, np.nan, "model", "failed"),
-        Dot(3, 0.0, "best", "b"),
-    ]
-    drawn = panel("p", "x", "y", [], dots, [rule(-10.0, "accepted", "optimum")], loss=True)
+    dots = [marks([1, 3], [-100.0, 0.0], "best", "ab"), marks([2], [np.nan], "model", ["failed"])]
+    drawn = panel("p", "x", "y", dots, [rule(-10.0, "accepted", "optimum")], loss=True)
     bottom, top = drawn.layout["yaxis"]["range"]
     assert bottom > 2 > 1 > top and drawn.layout["shapes"][0]["y0"] == 10.0
     known, failed = (trace["y"] for trace in drawn.data)

@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.figures.figure import Figure, Panel, calm_range, curve, fitted, legend, panel
+from grounded.figures.figure import Figure, Panel, calm_range, curve, fitted, panel
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.report.bodies import reading_order
@@ -80,7 +80,7 @@ def _figure(findings: Findings, name: str, title: str, of: Run | Log) -> Figure:
         said.append("held out")
     if trial.steps < of.trial.finite_steps:
         said.append(f"{begin:.4g} to {begin + trial.steps * trial.dt:.4g} s")
-    return Figure(name, title, ", ".join(said), panels, legend(panels))
+    return Figure(name, title, ", ".join(said), panels)
 
 
 def _worst_part(of: Run | Log) -> tuple[Trial, float]:
@@ -104,7 +104,7 @@ def residual_figures(findings: Findings) -> list[Figure]:
     channels = _channels(findings, latest)
     panels = [_over(findings, latest, state) for state in channels]
     title, of = "What the model lacks", latest.trial.id or "best"
-    return [Figure("residual", title, of, panels, legend(panels))]
+    return [Figure("residual", title, of, panels)]
 
 
 def _channels(findings: Findings, latest: Run | Log) -> list[int]:

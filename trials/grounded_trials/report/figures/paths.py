@@ -5,18 +5,17 @@ A mechanism without a position in the plane is drawn from the side, with the pat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from grounded.figures.figure import (
     WIDTHS,
-    Dot,
     Figure,
     Trace,
     curve,
-    legend,
+    marks,
     panel,
 )
 from grounded.frozen import Array
@@ -75,16 +74,14 @@ def path_figure(findings: Findings) -> Figure | None:
         return None
     panels, caption = [], []
     for view in views:
-        crosses = [dot for run in findings.runs for dot in _crash_mark(run, view)]
         curves = [_path(view, one) for one in drawn]
-        panels.append(
-            panel(view.title, *view.names, curves, crosses, equal=view.equal, kind="path")
-        )
+        curves += [mark for run in findings.runs for mark in _crash_mark(run, view)]
+        panels.append(panel(view.title, *view.names, curves, equal=view.equal, kind="path"))
     if not scene.spatial and not views[0].equal:
         caption.append(f"Phase plane of {listed(scene.names)}.")
     if any(crash(run) for run in findings.runs):
         caption.append("A cross marks where a run ended early.")
-    return Figure("paths", "Paths", " ".join(caption), panels, legend(panels[:1]))
+    return Figure("paths", "Paths", " ".join(caption), panels)
 
 
 def _drawn(findings: Findings) -> list[Drawn]:
@@ -149,10 +146,10 @@ def ended(run: Run) -> str:
     return f"{run.label} ended after {last:.2f} s of {whole:.2f} s"
 
 
-def _crash_mark(run: Run, view: View) -> Sequence[Dot]:
+def _crash_mark(run: Run, view: View) -> list[Trace]:
     last = crash(run)
     if last is None:
         return []
     x, y = (float(v) for v in view.place(run.trial.states[[last]])[0])
-    known = np.isfinite(x + y)
-    return [Dot(x, y, "model", ended(run), "cross", trial=run.trial.id)] if known else []
+    one = marks([x], [y], "model", [ended(run)], shape="cross", trial=run.trial.id)
+    return [one] if np.isfinite(x + y) else []

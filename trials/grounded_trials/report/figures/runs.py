@@ -9,14 +9,12 @@ import numpy as np
 from grounded.diagnosis.telling import gap_figures
 from grounded.figures.figure import (
     STEPS,
-    Dot,
     Figure,
-    Key,
     Panel,
     Trace,
     calm_range,
     curve,
-    legend,
+    marks,
     panel,
     rule,
 )
@@ -54,15 +52,16 @@ def all_figures(findings: Findings) -> list[Figure]:
 
 def _compared(
     findings: Findings, values: Callable[[Run], Array], column: int, style: str = "line"
-) -> tuple[list[Trace], list[Dot]]:
+) -> tuple[list[Trace], list[Trace]]:
     """Return a column of each compared run's values, with crosses where the run ended early."""
-    curves, dots, dt = list[Trace](), list[Dot](), findings.task.dt
+    curves, crosses, dt = list[Trace](), list[Trace](), findings.task.dt
     for role, run in compared(findings):
         each, name = values(run)[:, column], name_of(role, run)
         curves.append(_over_time(each, dt, role, name, style=style))
         if (last := crash(run)) is not None:
-            dots.append(Dot(last * dt, float(each[last]), role, f"{name} ended early", "cross"))
-    return curves, dots
+            said = [f"{name} ended early"]
+            crosses.append(marks([last * dt], [each[last]], role, said, shape="cross"))
+    return curves, crosses
 
 
 def state_figure(findings: Findings) -> Figure | None:
@@ -73,7 +72,7 @@ def state_figure(findings: Findings) -> Figure | None:
     task, paths = findings.task, named_paths(findings)
     if len(paths) < 2:
         return None
-    wanted, panels, end = asked_for(task), [], tuple[Key, ...]()
+    wanted, panels = asked_for(task), []
     for i in reading_order(task):
         name, unit = list(task.model.states.items())[i]
         along = i in wanted and task.reward.state[i] > 0
@@ -82,14 +81,14 @@ def state_figure(findings: Findings) -> Figure | None:
             for role, words, states in paths
             if role != "desired" or along
         ]
-        marks = _compared(findings, lambda run: run.trial.states, i)[1]
+        curves += _compared(findings, lambda run: run.trial.states, i)[1]
         if i in wanted and not along:
             at, value = task.horizon * task.dt, float(task.target[-1, i])
-            marks.append(Dot(at, value, "desired", DESIRED_END, "ring"))
-            end = (Key("desired", DESIRED_END, "ring"),)
+            asked = marks([at], [value], "desired", [DESIRED_END], shape="ring", name=DESIRED_END)
+            curves.append(asked)
         note = ESTIMATED * (name in findings.estimated)
-        panels.append(_timed(name, unit, curves, marks=marks, note=note))
-    return Figure("states", "States over time", "", panels, (*legend(panels), *end))
+        panels.append(_timed(name, unit, curves, note=note))
+    return Figure("states", "States over time", "", panels)
 
 
 def error_figure(findings: Findings) -> Figure | None:
@@ -105,17 +104,17 @@ def error_figure(findings: Findings) -> Figure | None:
             off = tracking_error(task, run.trial)[:, axes]
             return np.asarray(np.linalg.norm(off, axis=1, keepdims=True))
 
-        curves, marks = _compared(findings, distance, 0)
+        curves, crosses = _compared(findings, distance, 0)
         name, unit = "distance from the desired position", list(task.model.states.values())[axes[0]]
-        panels.append(_timed(name, unit, curves, most=50.0, marks=marks))
+        panels.append(_timed(name, unit, [*curves, *crosses], most=50.0))
     for i in (i for i in reading_order(task) if i in asked_for(task)):
         name, unit = list(task.model.states.items())[i]
-        curves, marks = _compared(findings, lambda run: tracking_error(task, run.trial), i)
+        curves, crosses = _compared(findings, lambda run: tracking_error(task, run.trial), i)
         _, run = shown[-1]
         gap, words = prediction_error(task, run)[:, i], f"real − predicted, {run.label}"
         curves.append(_over_time(gap, task.dt, "predicted", words, 1.0))
-        panels.append(_timed(f"{name} − target", unit, curves, most=50.0, marks=marks))
-    return Figure("error", "Tracking error", "", panels, legend(panels))
+        panels.append(_timed(f"{name} − target", unit, [*curves, *crosses], most=50.0))
+    return Figure("error", "Tracking error", "", panels)
 
 
 def input_figure(findings: Findings) -> Figure | None:
@@ -129,7 +128,7 @@ def input_figure(findings: Findings) -> Figure | None:
         )
         limits = [float(v) for v in (task.low[j], task.high[j]) if np.isfinite(v)]
         panels.append(_timed(name, unit, curves, limits))
-    return Figure("inputs", "Inputs", "", panels, legend(panels))
+    return Figure("inputs", "Inputs", "", panels)
 
 
 def bias_figure(findings: Findings) -> Figure | None:
@@ -155,7 +154,7 @@ def bias_figure(findings: Findings) -> Figure | None:
             mean = averaged(values[:, i] / task.dt, window)
             curves.append(_over_time(mean, window * task.dt, role, words, width, middle))
         panels.append(_timed(name, per_second(unit), curves, note=note))
-    return Figure("bias", "Bias", "", panels, legend(panels))
+    return Figure("bias", "Bias", "", panels)
 
 
 def _over_time(
@@ -177,15 +176,13 @@ def _timed(
     curves: Sequence[Trace],
     limits: Sequence[float] = (),
     most: float = 5.0,
-    marks: Sequence[Dot] = (),
     note: str = "",
 ) -> Panel:
     """Return a panel over time, scaled by `calm_range` around all but the model's own policy.
 
     If that run is cut off, or a limit is, the note states what lies outside.
     """
-    asked = [dot.y for dot in marks if dot.role == "desired"]
-    calm = [c["y"] for c in curves if c["meta"]["role"] != "model"] + [np.array(asked)]
+    calm = [c["y"] for c in curves if c["meta"]["role"] != "model"]
     wild = [c["y"] for c in curves if c["meta"]["role"] == "model"]
     within = np.array(calm_range(calm, wild, most))
     low, high = calm_range([within], [np.array(limits)]) if limits else within.tolist()
@@ -195,7 +192,6 @@ def _timed(
         "time [s]",
         shown(unit),
         curves,
-        marks,
         [rule(v, "limit", "limit") for v in limits],
         y_range=(low, high),
         note="; ".join(filter(None, (*beyond, note))),
