@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 from grounded_trials.workspace.folder import Folder
+from reported import car, cart
 from shared_data import DATA
+
+__all__ = ["car", "cart"]  # fixtures of all tests
 
 EXTRAS = {
     "view": "rerun",

@@ -3,8 +3,11 @@
 import csv
 import json
 import re
+import shutil
 import subprocess
 import sys
+import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +20,9 @@ from grounded.findings.catalogue import WEIGHTS
 from grounded.policy import load
 from grounded_cli.commands import cli
 from grounded_trials.starting.examples import EXAMPLES
+from grounded_trials.workspace.folder import Folder
+from reported import copied
+from shared_data import data, needs_data
 from workspaces import make
 
 COMMANDS = list(cli.commands)
@@ -32,9 +38,6 @@ def step(w):
     proposed = grounded("-C", w, "propose", "--json").json
     run = grounded("-C", w, "run", "--json").json
     return proposed, run, grounded("-C", w, "ingest", run["trial_file"], "--json").json
-
-
-# the frame
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -149,9 +152,6 @@ def test_studies_are_listed_as_words_and_as_json():
     listed = grounded("experiment", "--json").json["studies"]
     assert "flight" in listed and all(listed.values())
     assert list(listed) == [line.split()[0] for line in grounded("experiment").out.splitlines()]
-
-
-# the loop
 
 
 def test_init_lists_and_makes_workspaces(tmp_path):
@@ -288,3 +288,123 @@ def test_fit_shows_values_with_intervals_and_applies_them(w):
     assert set(only["params"]) == {"drag"}
     wrong = grounded("-C", w, "fit", "--params", "drg")
     assert wrong.code == 1 and holds(wrong.err, "drg", "'drag'")
+
+
+@pytest.fixture
+def learnt(cart, tmp_path):
+    return copied(cart, tmp_path / "w")
+
+
+def last(done):
+    assert done.code == 0, done.err
+    return plain(done.out).rstrip().splitlines()[-1]
+
+
+def test_a_trial_of_ours_needs_no_log_table(learnt, tmp_path):
+    (stored,) = learnt.glob("trials/t0001-*")
+    done = grounded("-C", learnt, "inspect", stored)
+    assert holds(done.out, stored.name, "trial", "c0001") and "[log." not in done.out
+    assert last(done) == "next: grounded report"
+    path = tmp_path / "run.mcap"
+    path.write_bytes(stored.read_bytes())
+    done = grounded("-C", learnt, "inspect", path)
+    assert last(done) == f"next: grounded ingest {path}"
+    assert grounded("-C", learnt, "inspect", path, "--json").json["log_table"] == ""
+
+
+def test_a_candidate_is_said_to_be_one(learnt):
+    done = grounded("-C", learnt, "inspect", learnt / "candidates" / "c0002.mcap")
+    assert holds(done.out, "c0002.mcap", "candidate") and "[log." not in done.out
+    assert last(done) == "next: grounded run c0002"
+
+
+def test_a_cut_trial_is_damaged_and_recover_is_next(learnt, tmp_path):
+    (stored,) = learnt.glob("trials/t0001-*")
+    path = tmp_path / "cut.mcap"
+    path.write_bytes(stored.read_bytes()[:-3000])
+    done = grounded("-C", learnt, "inspect", path)
+    assert f"{path}: DAMAGED, trial of c0001" in done.out and "[log." not in done.out
+    assert last(done) == f"next: grounded recover {path}"
+    assert path.name in done.err
+
+
+@needs_data
+def test_a_foreign_log_ends_with_a_table_that_can_be_pasted(tmp_path):
+    log = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
+    folder = make(tmp_path / "w", "car-turn").folder
+    done = grounded("-C", folder, "inspect", log)
+    assert last(done).startswith("# next: ")
+    table = tomllib.loads(done.out[done.out.index("# for grounded.toml") :])
+    assert table["log"]["input"]["throttle"]["path"] == "/throttle_1.data"
+    assert re.search(r"header .*\d\.\d ms", done.out)
+    model = Folder(folder).base_model
+    lost = [n for n in model.state_names if n not in table["log"].get("state", {})]
+    sent = [n for n in model.input_names if n not in table["log"].get("input", {})]
+    file = folder / "grounded.toml"
+    file.write_text(file.read_text() + done.out[done.out.index("# for grounded.toml") :])
+    more = "".join(f'\n[log.state.{name}]\npath = "/{name}.data"\n' for name in lost)
+    more += "".join(f'\n[log.input.{name}]\npath = "/{name}.data"\n' for name in sent)
+    file.write_text(file.read_text() + more)  # as a user maps what was not found
+    done = grounded("-C", folder, "inspect", log)
+    assert last(done).startswith("# next: grounded")
+
+
+@needs_data
+def test_outside_a_workspace_one_is_asked_for(tmp_path):
+    log = data("dart_small_car", "dart_4_sept_random_driving_slow_ros2.mcap")
+    done = grounded("-C", tmp_path, "inspect", log)
+    said = " ".join(done.err.split())
+    assert holds(said, "this folder is no workspace", "make one from the log", "-C DIR")
+    assert "grounded init DIR --from" in done.out
+
+
+@pytest.mark.slow
+def test_demo_prints_utilities_and_trials(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    there = find_spec  # no recording without rerun
+    monkeypatch.setattr(
+        "grounded_cli.demo.find_spec", lambda name: None if name == "rerun" else there(name)
+    )
+    done = grounded("demo", "pendulum", "--json")
+    assert done.code == 0, done.err
+    found = done.json
+    assert {"workspace", "utilities", "verdict", "trials"} <= set(found)
+    assert found["utilities"][-1] > 0.65 * found["utilities"][0]
+    folder = tmp_path / found["workspace"]
+    assert (folder / "grounded.toml").is_file() and (folder / "reports").is_dir()
+    assert "rrd" not in found["paths"] and found["paths"]["html"]
+    assert all((tmp_path / path).is_file() for path in found["paths"].values())
+    again = grounded("demo", "pendulum")
+    assert again.code == 1 and holds(again.err, found["workspace"])
+
+
+def test_demo_of_an_unknown_example(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    done = grounded("demo", "car-figure9")
+    assert done.code == 1 and holds(done.err, "car-figure9", "'car-figure8'")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_workspace_without_trials_has_a_report_and_no_diagnosis(tmp_path):
+    folder = make(tmp_path / "w").folder
+    assert grounded("-C", folder, "report").code == 0
+    for command in ("diagnose", "fit"):
+        done = grounded("-C", folder, command)
+        assert done.code == 1 and holds(done.err, "ingest", "--data")
+
+
+def test_reports_may_be_deleted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    shutil.rmtree(folder / "reports")
+    first = grounded("-C", folder, "report", "--html", "--json").json
+    shutil.rmtree(folder / "reports")
+    assert grounded("-C", folder, "report", "--html", "--json").json == first
+    assert grounded("-C", folder, "status").code == 0
+
+
+def test_fit_then_learn_reaches_as_far(cart, tmp_path):
+    w = copied(cart, tmp_path / "w")
+    before = grounded("-C", w, "status", "--json").json["best"]["utility"]
+    assert grounded("-C", w, "fit", "--latency", "--apply").code == 0
+    done = grounded("-C", w, "learn", "--json").json
+    assert done["best"]["utility"] >= before

@@ -1,6 +1,7 @@
 """What goes wrong: one clear message, the right exit code, nothing stored, no traceback."""
 
 import sys
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,10 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
+from grounded_trials import Workspace
+from grounded_trials.store.documents import write_document
+from grounded_trials.store.trial_file import read_trial
+from reported import DIAGNOSIS, copied
 from workspaces import CONFIG, MODEL, make
 
 DART_LOG = """
@@ -49,9 +54,6 @@ def trial(w):
     return Path(grounded("-C", w, "run", "--json").json["trial_file"])
 
 
-# files that are no trial
-
-
 def test_files_that_are_no_log(w, tmp_path):
     (tmp_path / "empty.mcap").write_bytes(b"")
     (tmp_path / "photo.mcap").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(range(64)))
@@ -62,9 +64,6 @@ def test_files_that_are_no_log(w, tmp_path):
     for name in names:
         for how in ([], ["--data"]):
             refused(w, "ingest", tmp_path / name, *how, holds=[name])
-
-
-# trials of ours, but not this workspace's
 
 
 def test_cut_and_flipped_trials(w, trial, tmp_path):
@@ -103,9 +102,6 @@ def test_a_trial_of_another_robot_clock_task_or_workspace(w, trial, tmp_path):
     refused(w, "ingest", trial, holds=["earlier task", "--data"])
     kept = grounded("-C", w, "ingest", trial, "--data", "--json").json["trials"][0]
     assert kept["candidate"] is None and kept["utility"] is None
-
-
-# runs that went wrong on the robot
 
 
 def rewritten(trial, path, change):
@@ -161,9 +157,6 @@ def test_a_run_that_went_wrong_is_stored_with_a_warning_and_the_search_goes_on(w
     assert grounded("-C", w, "learn", "--trials", "1").code == 0
 
 
-# model.py
-
-
 MODELS = {  # the text of model.py, and what the message names
     "syntax": (MODEL.replace("return {", "return {{"), ["model.py", "7"]),
     "raises": (MODEL + "\nraise RuntimeError('no battery')\n", ["18", "no battery"]),
@@ -205,8 +198,6 @@ def test_a_model_without_numbers_proposes_nothing_and_says_why(tmp_path, rate, w
     assert not list((folder / "candidates").iterdir())
 
 
-# target.csv
-
 GRID = "".join(f"{0.05 * i:.2f},0,1\n" for i in range(41))
 TARGETS = {  # the text of target.csv, and what the message names
     "empty": ("", []),
@@ -232,8 +223,6 @@ def test_a_target_that_is_wrong_names_line_and_column(tmp_path, name):
     assert done.code == 1 and "Traceback" not in done.err
     assert holds(done.err, "target.csv", *parts), done.err
 
-
-# [system]
 
 DRIVE = """import sys
 
@@ -314,9 +303,6 @@ def test_a_crash_of_the_users_drive_leaves_a_trial_that_says_how_far_it_came(tmp
     assert holds(taken.json["trials"][0]["warnings"][0], 30, 40)
 
 
-# other files in a workspace
-
-
 def test_strange_files_in_the_workspace_disturb_nothing(w, trial):
     assert grounded("-C", w, "ingest", trial).code == 0
     for path in ("candidates/c0001 (copy).mcap", "candidates/notes.txt", "candidates/cold.mcap"):
@@ -337,3 +323,93 @@ def test_a_damaged_candidate_says_what_to_do(w, trial):
     assert done.code == 1 and "c0001" in done.err and "Traceback" not in done.err
     path.unlink()
     assert grounded("-C", w, "propose").code == 0
+
+
+@pytest.fixture
+def learnt(cart: Path, tmp_path: Path) -> Path:
+    return copied(cart, tmp_path / "w")
+
+
+def test_trials_may_be_given_as_a_list_with_commas_and_twice(learnt):
+    before = len(list((learnt / "trials").glob("n*.json")))
+    done = grounded("-C", learnt, "discard", "t0001,t0002", "T0001", "--json")
+    assert done.code == 0 and list(done.json["trials"]) == ["t0001", "t0002"]
+    assert len(list((learnt / "trials").glob("n*.json"))) == before + 2  # one note each
+    done = grounded("-C", learnt, "restore", "t0001,t0002", "--json")
+    assert list(done.json["trials"]) == ["t0001", "t0002"] and not done.json["discarded"]
+
+
+# words at a workspace whose search has ended, the exit code, and what the message names
+SLIPS = [
+    (["adopt", "delay"], 1, "'delay:force'"),
+    (["status", "-C", "grounded.toml"], 1, "-C"),
+    (["ingest", "."], 1, "workspace"),
+    (["ingest", "model.py"], 1, "model.py"),
+    (["diagnose", "--trials", "t9,"], 1, "t0001"),
+    (["diagnose", "--without", "delay,delai"], 1, "'delay'"),
+    (["diagnose", "--trials", " , "], 1, "--trials"),
+    (["fit", "--params", ","], 1, "--params"),
+    (["recover", "trials"], 1, "folder"),
+    (["recover", "model.py"], 1, "model.py"),
+    (["ingest", "nofile.mcap"], 1, "nofile.mcap"),
+    (["ingest", "no/nofile.mcap"], 1, "folder no"),
+    (["inspect", "nowhere.mcap"], 1, "nowhere.mcap"),
+    (["export", "best", "--format", "csv", "-o", "x.npz"], 2, "--format"),
+    (["target", "line", "--to", "x=1", "--seconds", "1e9"], 1, "200000"),
+    (["target", "step", "--hold", "1"], 2, "--hold"),
+    (["target", "circle", "--seconds", "1"], 2, "--seconds"),
+    *(
+        (["target", "line", "--to", f"x={value}", "--seconds", "2"], 2, f"x={value}")
+        for value in ("nan", "-inf", "fast", "")
+    ),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "named"), SLIPS)
+def test_a_mistake_is_named(learnt, monkeypatch, words, code, named):
+    monkeypatch.chdir(learnt)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        done = grounded(*words)
+    assert done.code == code and named in " ".join(done.err.split()), done.err
+    assert "Errno" not in done.err and "nan" not in done.err.replace("x=nan", "")
+
+
+def test_nothing_was_diagnosed_yet(tmp_path):
+    done = grounded("-C", make(tmp_path / "w").folder, "adopt", "x:y")
+    assert done.code == 1 and plain(done.err).endswith("next: grounded diagnose\n")
+
+
+def test_the_best_one_is_run_again_by_that_name(learnt, tmp_path):
+    here = Workspace(learnt)
+    best = here.status().standing.incumbent.candidate.id
+    ran = here.run("best")
+    assert ran.candidate == best and here.ingest(ran.trial_file).verdict == "run again"
+    assert grounded("-C", make(tmp_path / "empty").folder, "run", "best").code == 1
+
+
+def test_a_stored_trial_its_file_and_its_table_are_targets(learnt):
+    table, (own,) = learnt / "t0001.csv", (learnt / "trials").glob("t0001-*.mcap")
+    assert grounded("-C", learnt, "export", "t0001", "--format", "csv", "-o", table).code == 0
+    ran = read_trial(own)[0].states
+    for given in ("T0001", own, table):
+        (learnt / "target.csv").write_text("")
+        done = grounded("-C", learnt, "target", given, "--json")
+        assert done.code == 0 and sorted(done.json["columns"]) == ["v", "x"], done.err
+        drawn = np.genfromtxt(learnt / "target.csv", delimiter=",", names=True)
+        np.testing.assert_allclose(drawn["x"], ran[:, 0], atol=1e-5)
+    assert grounded("-C", learnt, "discard", "t0001").code == 0
+    done = grounded("-C", learnt, "target", "t0001")
+    assert done.code == 1 and "restore" in done.err
+
+
+@pytest.mark.parametrize("changed", [True, False])
+def test_nothing_is_adopted_from_two_robots_compared(learnt, changed):
+    value = {"value": 0.1, "std": 0.01}
+    one = {"effect": "parameter:m", "quantity": "m", "first": value, "second": value}
+    made = {"trials": ["t0001", "t0002"], "named": ["t0002"], "compared": ["t0001"]}
+    document = {**DIAGNOSIS, "changed": [one] * changed, "diagnosed": made}
+    write_document(learnt / "reports" / "diagnosis.json", document)
+    before = (learnt / "grounded.toml").read_text()
+    done = grounded("-C", learnt, "adopt", "viscous_friction:v")
+    assert done.code == changed and ((learnt / "grounded.toml").read_text() == before) == changed

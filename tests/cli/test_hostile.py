@@ -1,4 +1,4 @@
-"""Terminals, pipes, devices, strangers' code: what a file or a shell may do to a command."""
+"""Terminals, pipes, devices, strangers' code: what file, shell or model may do to a command."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import warnings
+from itertools import cycle
 from pathlib import Path
 
 import pytest
@@ -24,10 +25,8 @@ from grounded_cli import main
 from grounded_cli.console.terminal import harmless, show, show_json, style, table
 from grounded_trials.store.store import Store, write_atomically
 from pace import crowding, slowness
-from reported import car
-from workspaces import make
-
-__all__ = ["car"]
+from user_code import DEEDS, HARMLESS, PLACES
+from workspaces import MODEL, make
 
 EVIL = "\x1b]0;title\x07\x1b[8m\x9b2J\u202e\u200b\r"
 
@@ -257,3 +256,23 @@ def test_init_that_was_cut_off_goes_on(tmp_path: Path, monkeypatch: pytest.Monke
     (tmp_path / "mine" / "model.py").write_text("mine")
     assert "exists already" in grounded("init", tmp_path / "mine", "--example", "pendulum").err
     assert (tmp_path / "mine" / "model.py").read_text() == "mine"
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_what_a_model_prints_goes_to_stderr(tmp_path, place):
+    deed = "\n".join(list(DEEDS.values())[:HARMLESS])
+    make(tmp_path / "w", model=PLACES[place](MODEL, deed))
+    done = process("-C", "w", "propose", "--json", cwd=tmp_path)
+    assert done.code == 0 and done.json["candidate"] == "c0001"
+    assert (tmp_path / "w" / "candidates" / "c0001.mcap").exists()
+    assert "printed" in done.err and "written" in done.err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("deed", "place"), [*zip(list(DEEDS)[HARMLESS::2], cycle(PLACES))])
+def test_whatever_a_model_raises_is_one_message(tmp_path, place, deed):
+    make(tmp_path / "w", model=PLACES[place](MODEL, DEEDS[deed]))
+    done = process("-C", "w", "propose", "--json", cwd=tmp_path)
+    assert done.code == 1 and done.out == ""
+    assert done.err.count("error: ") == 1 and "model.py" in done.err
+    assert "Traceback" not in done.err

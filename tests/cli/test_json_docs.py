@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from reported import cart, copied
-
-__all__ = ["cart"]
+from reported import copied
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "json.md"
 

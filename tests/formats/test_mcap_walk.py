@@ -1,4 +1,4 @@
-"""The walk over MCAP's records, against the format's own conformance files and other writers."""
+"""MCAP's records, read and written, against the format's conformance files and other writers."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import tarfile
 import zlib
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.stream_reader import StreamReader
 from mcap.writer import CompressionType, Writer
@@ -25,6 +26,8 @@ from grounded_trials.formats.mcap_records import (
     Schema,
 )
 from grounded_trials.formats.mcap_walk import MAGIC, DamagedFile, read_records
+from grounded_trials.formats.mcap_writer import CHUNK_SIZE, McapWriter
+from grounded_trials.formats.protobuf import encode_doubles, encode_lists, file_descriptor_set
 from shared_data import data, files, needs_data
 
 
@@ -201,3 +204,52 @@ def test_a_chunk_with_a_flipped_bit_is_refused() -> None:
     with pytest.raises(DamagedFile, match=holding("chunk", "checksum")) as refused:
         plain(bytes(source))
     assert refused.value.offset > 0
+
+
+TABLE, ABOUT = {"kind": "candidate", "units": "m, °"}, "A text, ä.".encode()
+CHANNELS = (
+    ("/policy", "Policy", ["gain", "none"], True),
+    ("/state", "State", ["x", "v"], False),
+    ("/input", "Input", ["u"], False),
+)
+
+
+def by_the_package(rows, compressed):
+    stream = io.BytesIO()
+    kind = CompressionType.ZSTD if compressed else CompressionType.NONE
+    log = Writer(stream, compression=kind, enable_data_crcs=True)
+    log.start("p", "grounded")
+    log.add_metadata("grounded", TABLE)
+    log.add_attachment(3, 0, "about", "text/plain", ABOUT)
+    for topic, message, names, repeated in CHANNELS:
+        data = file_descriptor_set(message, names, repeated=repeated)
+        schema = log.register_schema(f"grounded.{message}", "protobuf", data)
+        log.register_channel(topic, "protobuf", schema)
+    for channel, k, time, data in rows:
+        log.add_message(channel, time, data, time, k)
+        if k == 2:
+            log.flush()
+    log.finish()
+    return stream.getvalue()
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize(("steps", "width"), [(0, 1), (1, 1), (7, 3), (300, 40), (4000, 90)])
+def test_the_bytes_are_those_of_the_package(steps, width, compressed):
+    rng = np.random.default_rng(steps)
+    lists = encode_lists([rng.standard_normal((steps, width)), np.empty((steps, 0))])
+    columns = [lists, *(encode_doubles(rng.standard_normal((steps, k))) for k in (2, 1))]
+    rows = [(c + 1, k, 20_000_000 * k, columns[c][k]) for k in range(steps) for c in (0, 2, 1)]
+    stream = io.BytesIO()
+    log = McapWriter(stream, Header("p", "grounded"), compressed=compressed)
+    log.metadata("grounded", TABLE)
+    log.attachment("about", "text/plain", ABOUT, create_time=3)
+    for topic, message, names, repeated in CHANNELS:
+        log.doubles(topic, message, names, repeated=repeated)
+    for channel, k, time, content in rows:
+        log.message(channel, time, content)
+        if k == 2:
+            log.flush()
+    log.finish()
+    assert stream.getvalue() == by_the_package(rows, compressed)
+    assert steps < 4000 or compressed or len(stream.getvalue()) > 2 * CHUNK_SIZE

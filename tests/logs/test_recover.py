@@ -7,10 +7,8 @@ import pytest
 
 from cli import grounded, plain
 from facts import holds
-from reported import cart, copied
+from reported import copied
 from shared_data import DATA, needs_data
-
-__all__ = ["cart"]
 
 
 @pytest.fixture

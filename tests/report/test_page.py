@@ -1,4 +1,4 @@
-"""The page: complete, alone, small, safe from names."""
+"""The page: complete, alone, small, safe from names and from numbers without a picture."""
 
 from __future__ import annotations
 
@@ -9,19 +9,24 @@ from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
+import pytest
 
 from grounded.diagnosis.parts import Diagnosis
 from grounded.errors import NextCommand
 from grounded.findings import found
-from grounded_trials.report.gathering import gather
+from grounded_cli.report import report_text
+from grounded_trials.report.figures.gap import forecast_figures
+from grounded_trials.report.figures.png import png
+from grounded_trials.report.figures.runs import all_figures, error_figure, state_figure
+from grounded_trials.report.findings import ESTIMATED
+from grounded_trials.report.gathering import RUNAWAY, gather
 from grounded_trials.report.page import page
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.folder import Folder
 from pace import slowness
 from page_browser import unpacked
-from reported import DIAGNOSIS, car, cart, gathered, many_flights
+from reported import DIAGNOSIS, gathered, many_flights
 
-__all__ = ["car", "cart"]
 EVIL = '<img src=x onerror="window.hacked=1"></script><script>window.hacked=2</script>\'&'
 
 
@@ -158,3 +163,73 @@ def test_names_are_text_never_markup(cart):
     assert not [a for t, a in tags.seen if t == "img" or "onerror" in a]
     assert [t for t, _ in tags.seen].count("script") == 3  # the data, Plotly, our own
     assert "".join(tags.text).count("window.hacked=2") > 10
+
+
+def weighed(findings, **weights):
+    """The findings with other weights on the states along the way, none at the end."""
+    names = findings.task.model.state_names
+    state = np.array([weights.get(name, 0.0) for name in names])
+    reward = replace(findings.task.reward, state=state, terminal=0 * state)
+    target = np.nan_to_num(findings.task.target)
+    return replace(findings, task=replace(findings.task, reward=reward, target=target))
+
+
+def test_no_path_is_desired_of_a_state_without_a_weight(car):
+    findings = weighed(gathered(car), x=10.0, y=10.0)
+    states, errors = state_figure(findings), error_figure(findings)
+    assert states is not None and errors is not None
+    desired = {
+        p.title for p in states.panels if any(c["meta"]["role"] == "desired" for c in p.curves)
+    }
+    assert desired == {"x [m]", "y [m]"} and "v [m/s]" in {p.title for p in states.panels}
+    assert not any(p.title.startswith(("v ", "psi ")) for p in errors.panels)
+    assert not any("desired at" in str(t.get("text")) for p in states.panels for t in p.data)
+
+
+def test_states_that_no_sensor_gives_are_said_to_be_estimates(cart):
+    findings = gathered(cart)
+    assert findings.estimated == () and ESTIMATED not in page(findings)
+    findings = replace(findings, estimated=("v",))
+    states = state_figure(findings)
+    assert states is not None
+    for figure in (states, forecast_figures(findings)[0]):
+        notes = {p.title: p.note for p in figure.panels}
+        assert ESTIMATED in notes["v [m/s]"] and ESTIMATED not in notes["x [m]"]
+
+
+def _jump(states):
+    states[15:], states[16::2] = 1e300, -1e300
+
+
+CASES = {
+    "huge": lambda s: s.fill(1e200),
+    "jumps": _jump,
+    "zero": lambda s: s.fill(0.0),
+    "infinite": lambda s: s[10:].fill(np.inf),
+    "unknown": lambda s: s.fill(np.nan),
+    "tiny": lambda s: s.fill(1e-300),
+    "constant": lambda s: s.fill(1e12),
+    "offset": lambda s: np.copyto(s, 1e9 + 1e-3 * np.random.default_rng(0).random(s.shape)),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.extra("view", "png")
+def test_a_report_is_made_of_any_numbers(car, tmp_path, case):
+    from grounded_trials.report.recording import write_recording
+
+    findings, runs = gathered(car), []
+    for run in findings.runs:
+        states = np.array(run.trial.states)
+        CASES[case](states)
+        states[np.abs(states) > RUNAWAY] = np.nan  # as they are gathered
+        runs.append(replace(run, trial=replace(run.trial, states=states)))
+    findings = replace(findings, runs=tuple(runs))
+    head, data = page(findings).split('id="data">')
+    assert "nan" not in head.split("<style>")[0].lower() + head.split("</style>")[1].lower()
+    assert json.loads(data.split("</script>")[0])["panels"]
+    figure = all_figures(findings)[1 + list(CASES).index(case) % 2]  # the paths, the states
+    assert len(png(figure)) > 1000
+    write_recording(findings, tmp_path / "r.rrd")
+    assert "next: grounded" in report_text(findings)

@@ -12,9 +12,8 @@ from test_page import hostile
 
 from grounded_trials.report.page import page
 from page_browser import browser, missing
-from reported import car, cart, gathered
+from reported import gathered
 
-__all__ = ["car", "cart"]
 pytestmark = [
     pytest.mark.skipif(bool(missing()), reason=missing() or "-"),
     pytest.mark.extra("report"),

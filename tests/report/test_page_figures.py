@@ -26,10 +26,7 @@ from grounded_trials.report.bodies import scene_of
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.forecast import forecast
-from reported import car, cart, gathered, many_flights
-
-__all__ = ["car", "cart"]
-
+from reported import gathered, many_flights
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
 FIGURES += ("forecast", "residual")

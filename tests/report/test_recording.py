@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from facts import holding
-from reported import car, cart, gathered, many_flights
+from reported import gathered, many_flights
 
-__all__ = ["car", "cart"]
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 from grounded_trials.report.recording import entity_of, over_time, write_recording
 

@@ -1,13 +1,21 @@
-"""The sentence on the certainty of an improvement, and the verdicts on candidates."""
+"""How certain an improvement is, the scatter between runs, and the step rule."""
 
 from dataclasses import replace
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
-from scipy.stats import ttest_ind
+from scipy.stats import t, ttest_ind
 
 from grounded.search.candidate import Tried
-from grounded.search.difference import Difference, Repeats, in_question, with_chance
+from grounded.search.difference import PIECES, Difference, Repeats, in_question, with_chance
+from grounded.search.step_size import (
+    LARGEST_DAMPING,
+    SMALLEST_DAMPING,
+    Step,
+    after_failure,
+    after_success,
+)
 
 
 def tried(*utilities, accepted=True, base="c0001"):
@@ -57,3 +65,49 @@ def test_a_run_within_the_scatter_of_repeats_is_not_called_better(utility, repea
     pool, befores = Repeats(history), [None, *history]
     told = [with_chance(*two, history, pool) for two in zip(history, befores, strict=False)]
     assert [one.verdict() for one in told] == ["first", "better", word]
+
+
+def runs(pieces, cost=10.0):
+    """Return a candidate whose runs have these utilities in each part, plus a common cost."""
+    utilities = tuple(float(u) for u in pieces.sum(axis=1) - cost)
+    candidate = SimpleNamespace(base="c0001", model="m", id="c0002")
+    return Tried(candidate, (None,) * len(pieces), utilities, True, pieces=pieces)
+
+
+def test_intervals_from_two_repeats_hold_as_often_as_they_say():
+    rng = np.random.default_rng(0)
+    inside, least, width = [], [], []
+    for _ in range(600):
+        pair = runs(rng.normal(size=(2, PIECES)))
+        scatter = Repeats([pair]).near(pair.utility)
+        error = scatter.error(2)
+        inside.append(abs(pair.utility + 10.0) < t.ppf(0.95, scatter.freedom) * error)
+        least.append(np.sqrt(scatter.variance) / 2.0)  # of the true deviation, sqrt(PIECES)
+        width.append(np.std(pair.utilities, ddof=1) / 2.0)
+    assert 0.87 < np.mean(inside) < 0.97  # of 0.9
+    assert np.quantile(least, 0.01) > 0.2 > 10 * np.quantile(width, 0.01)
+
+
+def test_a_kept_promise_lowers_the_damping_and_a_broken_one_raises_it():
+    assert after_success(Step(0.9), 100.0, 95.0) == Step(pytest.approx(0.03))
+    assert after_success(Step(0.1), 100.0, 60.0) == Step(0.1)
+    assert after_success(Step(0.1), 100.0, 10.0) == Step(1.0)
+    assert after_success(Step(1.0), 100.0, 10.0) == Step(10.0)
+    assert after_success(Step(LARGEST_DAMPING), 100.0, 10.0) == Step(LARGEST_DAMPING)
+    assert after_success(Step(SMALLEST_DAMPING), 100.0, 100.0) == Step(SMALLEST_DAMPING)
+
+
+def test_failures_damp_first_and_halve_then():
+    step, seen = Step(0.1), []
+    while step is not None:
+        seen.append((step.damping, step.alpha))
+        step = after_failure(step, max_halvings=2)
+    assert seen == [
+        (0.1, 1.0),
+        (1.0, 1.0),
+        (10.0, 1.0),
+        (100.0, 1.0),
+        (LARGEST_DAMPING, 1.0),
+        (LARGEST_DAMPING, 0.5),
+        (LARGEST_DAMPING, 0.25),
+    ]

@@ -1,4 +1,6 @@
-"""The start of DDP: a closed-loop run near the target, for every manoeuvre."""
+"""The start of DDP and first plans: goals that sensors see late, small limits, play, trim."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,11 +9,13 @@ import grounded as gr
 from grounded.experiments.car_tasks import NAMES, car_task
 from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
+from grounded.model import Model
 from grounded.models import aircraft, car, pendulum
-from grounded.search.first_guess import first_guess
+from grounded.search.first_guess import first_guess, trim
 from grounded.search.first_policy import first_policy
+from grounded.search.planner import Planner, planner_with, predicted
 from grounded.solve import ddp
-from small_tasks import cart_task, rover_task
+from small_tasks import DT, cart, cart_task, plain_task, rover_task, speed_rover, speed_rover_task
 
 TASKS = {
     **{f"car {name}": (lambda name=name: car_task(name, car.model), 25.0) for name in NAMES},
@@ -82,3 +86,96 @@ def test_a_derivative_without_a_number_is_told_by_its_names():
     told = no_plan(step=step, jacobian=slopes)
     assert "derivative of state 'v' by 'a' is not finite at 0 s" in told
     assert "test_first_policy.py" in told
+
+
+STEPS = 60
+
+
+def sensed_late(
+    terminal: float, lag: float = 0.04, change: float = 1e-4, rests: int = 10
+) -> Planner:
+    """A cart that moves 0.4 m in 1.2 s; its speed sensor has a filter."""
+    model = Model(
+        states={"x": "m", "v": "m/s"},
+        inputs={"force": "N"},
+        params={},
+        derivative=lambda s, a, p: {"x": s.v, "v": 2.0 * a.force - 0.5 * s.v},
+    )
+    way = np.clip(np.arange(STEPS + 1) / (STEPS - rests), 0.0, 1.0)
+    x = 0.4 * way**2 * (3 - 2 * way)
+    target, ends = np.column_stack([x, np.gradient(x, 0.02)]), terminal * np.array([500.0, 50.0])
+    task = plain_task(model, 0.02, target, [10.0, 0.5], 10.0, terminal=ends, change=change)
+    return planner_with(task, [("sensor_lag:v", {"tau": lag})] if lag else [])
+
+
+def test_the_end_is_asked_of_the_true_speed(terminal=1.0):
+    planner = sensed_late(terminal)
+    policy, _ = planner.first_policy()
+    run = predicted(planner.plan.problem(exact=True), policy)
+    true = run.states[-1, planner.plan.model.state_names.index("v_true")]
+    assert abs(true) < 0.02 and abs(run.states[-1, 0] - 0.4) < 0.005
+    assert np.abs(run.inputs[-3:]).max() < 0.5 * np.abs(run.inputs).max()
+
+
+def test_a_limit_below_the_width_of_smoothing_is_planned_through():
+    """A warehouse robot's first plan used 0.035 of a limit of 0.05: -85.6 in place of -0.004."""
+    effects = [("rate_limit:linear", {"r": 0.7}), ("rate_limit:angular", {"r": 3.0})]
+    effects.append(("delay:linear+angular", {"d": 0.128}))
+    found = []
+    for width in (0.05, 0.0):
+        planner = planner_with(replace(speed_rover_task(speed_rover()), smoothing=width), effects)
+        policy, _ = planner.first_policy()
+        found.append(predicted(planner.plan.problem(exact=True), policy).utility)
+    assert 0.7 * DT < 0.05  # a step of the limit, the width
+    assert found[0] > 1.02 * max(found) and found[0] > -0.25
+
+
+LATE = ("delay:turn", {"d": 0.12})  # with TASK, 2.8 steps: without play, z has three past inputs
+TASK = rover_task()
+
+
+def with_play(width):
+    return planner_with(TASK, [("backlash:turn", {"b": width}), LATE])
+
+
+@pytest.fixture(scope="module")
+def late():
+    planner = planner_with(TASK, [LATE])
+    return planner, planner.first_policy()[0]
+
+
+def from_aside(planner, policy):
+    """The predicted utility of a run that starts 0.2 m and 0.3 rad off."""
+    problem = planner.plan.problem(exact=True)
+    start = problem.start.copy()
+    start[:3] += [0.1, -0.2, 0.3]
+    return predicted(replace(problem, start=start), policy).utility
+
+
+def test_a_model_with_less_latency_feeds_back_what_the_policy_does(late):
+    planner, policy = late
+    play = with_play(1e-9)
+    assert policy.depths == (1, 3) and play.plan.problem().depths == (1, 2)
+    assert np.abs(policy.gain[:, 1, -1]).max() > 0.05
+    assert from_aside(play, policy) == pytest.approx(from_aside(planner, policy), rel=1e-3)
+    wide = play.widened(policy)
+    assert wide.depths == (1, 3) and (wide.gain[:, :, -1] == policy.gain[:, :, -1]).all()
+
+
+def test_a_planner_remembers_what_earlier_policies_feed_back(late):
+    planner, policy = late
+    play = with_play(0.1)
+    more = play.feeding_back([policy])
+    assert more.plan.problem().depths == more.aim.problem().depths == (1, 3)
+    assert more.fingerprint == play.fingerprint and more.plays == play.plays
+    assert planner.feeding_back([policy]) is planner
+
+
+def test_a_cart_that_follows_a_known_motion_needs_the_force_of_newton():
+    task = cart_task()
+    t = 0.05 * np.arange(41)
+    x = np.column_stack([1 - np.cos(t), np.sin(t)])
+    _, u = trim(task, x, np.array([True, True]))
+    np.testing.assert_allclose(u[:, 0], (np.cos(t) + 0.2 * np.sin(t))[:-1], atol=0.1)
+    moved = cart.system.step(x[:-1], u, cart.values, 0.05)
+    assert np.abs(moved - x[1:]).max() < 2e-3

@@ -14,10 +14,8 @@ from grounded.errors import GroundedError
 from grounded_trials import Workspace
 from grounded_trials.store.documents import read_document
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
-from reported import cart, copied
+from reported import copied
 from workspaces import CONFIG, make
-
-__all__ = ["cart"]
 
 
 def learnt(folder, trials=2, **files):

@@ -25,10 +25,8 @@ from grounded_trials.workspace.last_diagnosis import model_print, read_diagnosis
 from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis
 from grounded_trials.workspace.user_files.config import set_keys
 from recorded import LOGGED, record
-from reported import DIAGNOSIS, cart, copied, diagnosed
+from reported import DIAGNOSIS, copied, diagnosed
 from workspaces import make
-
-__all__ = ["cart"]
 
 FIRST, SECOND = DIAGNOSIS["ranking"]
 NONE = {"kind": "none", "effects": [], "sentence": "None."}

@@ -1,8 +1,4 @@
-"""Where a run begins in a recording: a second arm was refused, or stored a second out of step.
-
-A cart with feedback and noisy sensors is recorded at 100 Hz; whoever records begins before the run.
-Sought by the feed-forward alone, and only for what fitted nobody, starts were missed.
-"""
+"""Where a run begins in a recording, with feedback and noise, between rows, without speeds."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -16,7 +12,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.policy import Policy
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import Series, SignalSpec
-from grounded_trials.workspace.intake.opening import foreign
+from grounded_trials.workspace.intake.opening import foreign, run_start
 from grounded_trials.workspace.intake.opening.run_start import recording
 from recorded import LOGGED, RATE, record, rows_of, stored_from, waiting, written
 from workspaces import make
@@ -310,3 +306,134 @@ def test_another_run_of_the_best_is_taken_without_its_name(w, tmp_path):
         w.ingest(log)
     assert error.value.then == NextCommand("ingest", (str(log), "--candidate", other))
     assert len(w.trials()) == 3
+
+
+ONLY_POSITIONS = LOGGED.replace('[log.state.v]\npath = "/csv.v"\n', "") + (
+    "[estimate]\nmeasured = { x = 0.002 }\n"
+)
+
+
+@pytest.fixture
+def blind(tmp_path):
+    """Nothing measures its speed; it waits for c0002, and its controller had its own estimate."""
+    return waiting(tmp_path, ONLY_POSITIONS)
+
+
+@pytest.mark.parametrize("differs", [0, 16], ids=["known", "a program's speeds lag"])
+def test_a_run_is_found_where_speeds_are_estimated(blind, tmp_path, differs):
+    policy = blind.candidate("c0002")[0].policy
+    path = record(blind, tmp_path / "a.csv", policy, 0.8, differs=differs)
+    found = blind.ingest(path)
+    assert found.candidate == "c0002"
+    stored_from(blind, path, 0.8)
+    assert {one.name for one in found.signals} == {"x", "force"}  # what was logged
+
+
+def test_an_estimated_speed_knows_what_came_before_the_run_and_after_it(blind, tmp_path):
+    policy, off = blind.candidate("c0002")[0].policy, []
+    for seed in range(3):
+        path = record(blind, tmp_path / f"{seed}.csv", policy, 0.8, seed=seed)
+        blind.ingest(path, candidate="c0002")
+        table = rows_of(path)
+        truth = table[80 + 5 * np.arange(policy.horizon + 1), 2]  # measured, to 0.01 m/s
+        found = blind.trials()[-1].trial.states[:, 1]
+        assert found[0] == 0.0  # it stood still until its first command
+        off.append(found - truth)
+    assert np.abs(np.mean(off, axis=0)[[0, -1]]).max() < 0.03
+    assert np.sqrt(np.mean(np.square(off))) < 0.03
+
+
+ITS_OWN = LOGGED + "[estimate]\nmeasured = { x = 0.002 }\n"
+ROUGH = (0.002, 0.5)  # m, m/s: a speed by differences
+
+
+def test_a_run_is_known_by_the_speeds_that_its_program_made_itself(tmp_path, before=0.8):
+    w = waiting(tmp_path, ITS_OWN)
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, before, noise=ROUGH)
+    found = w.ingest(path)
+    assert found.candidate == "c0002"
+    stored, table, k = stored_from(w, path, before)
+    assert np.std(stored.states[:-1, 1] - table[k, 2]) > 0.3  # estimated all the same
+    assert [one.about for one in of_code(found, "log.unread")] == [("v",)]
+
+
+def test_a_motor_wired_wrongly_is_told_where_no_start_is_found(blind, tmp_path, after=1.0):
+    policy = blind.candidate("c0002")[0].policy
+    wild = replace(policy, gain=40 * policy.gain)  # the commands don't tell where the run begins
+    path = record(blind, tmp_path / "a.csv", wild, 0.5, turned=True, after=after)
+    with pytest.raises(GroundedError, match="force acted the other way round") as error:
+        blind.ingest(path)
+    assert (error.value.then.verb, error.value.then.arguments) == ("export", ("c0002", "--runner"))
+    forced = blind.ingest(path, candidate="c0002")
+    assert of_code(forced, "run.reversed")
+    assert (forced.then.verb, forced.then.arguments) == ("discard", (forced.trial,))
+
+
+def run(w, path, policy, strange, before=1.0):
+    """The log of a run, its first commands `strange`, not the policy's; each with its own stamp."""
+    record(w, path, policy, before)
+    table = rows_of(path)
+    every, first = round(policy.dt * RATE), round(before * RATE)
+    for k, force in enumerate(strange):
+        table[first + k * every : first + (k + 1) * every, 3] = force
+    table[(np.arange(len(table)) - first) % every != 0, 3] = np.nan
+    return written(path, table)
+
+
+def unsent(w, path, policy, missed):
+    """The log of a run of which the first steps were never sent, nor anything before."""
+    run(w, path, policy, ())
+    table = rows_of(path)
+    table[: round((1.0 + missed * policy.dt) * RATE), 3] = np.nan
+    return written(path, table)
+
+
+@pytest.mark.parametrize("missed", [0, 2])
+def test_a_run_whose_first_steps_were_not_sent_begins_before_its_first_command(w, tmp_path, missed):
+    policy = w.candidate("c0002")[0].policy
+    found = w.ingest(unsent(w, tmp_path / "a.csv", policy, missed))
+    told = of_code(found, "run.missed")
+    assert found.candidate == "c0002" and len(told) == bool(missed)
+    assert all(one.facts["steps"] == missed for one in told)
+    assert not of_code(found, "log.gaps", "log.late")
+    stored = w.trials()[-1]
+    assert int(stored.meta["start_ns"]) * 1e-9 == pytest.approx(1001.0, abs=0.2 / RATE)
+    np.testing.assert_array_equal(stored.trial.inputs[:missed, 0], w.task.past[0])
+    np.testing.assert_array_equal(stored.trial.inputs[missed:, 0] != 0, True)
+
+
+def test_a_log_that_was_stored_a_step_late_is_another_trial_once_that_is_discarded(
+    w, tmp_path, monkeypatch
+):
+    log = unsent(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, 1)
+    with monkeypatch.context() as before:
+        before.setattr(run_start.Recording, "_before_first", lambda *_: None)
+        late = w.ingest(log, candidate="c0002")
+    w.discard(late.trial)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and found.trial != late.trial and not found.known
+
+
+def test_a_run_whose_first_commands_were_not_sent_is_its_candidate_s(w, tmp_path):
+    log = run(w, tmp_path / "a.csv", w.candidate("c0002")[0].policy, (-5.0, -4.9))
+    toml = w.folder / "grounded.toml"
+    toml.write_text(toml.read_text() + "[log.span]\nstart = 1.0\n")
+    w = Workspace(w.folder)
+    found = w.ingest(log)
+    assert found.candidate == "c0002" and not of_code(found, "log.not_run")
+    begun = int(w.trials()[-1].meta["start_ns"]) * 1e-9
+    assert begun == pytest.approx(1001.0, abs=0.2 / RATE)
+
+
+def test_rows_out_of_step_with_the_commands_tell_together_when_a_run_begins(w, tmp_path, row=0.011):
+    policy = w.candidate("c0002")[0].policy
+    path = record(w, tmp_path / "a.csv", policy, 0.8)
+    table = rows_of(path)
+    t = np.arange(table[0, 0] + 0.003, table[-1, 0], row)
+    at = np.floor((t - table[0, 0]) * RATE + 1e-6).astype(int)
+    rows = [t, *(np.interp(t, table[:, 0], table[:, k]) for k in (1, 2)), table[at, 3]]
+    found = w.ingest(written(tmp_path / "b.csv", np.transpose(rows)))
+    assert found.candidate == "c0002" and not of_code(found, "log.start_loose")
+    begun = w.trials()[-1].meta["start_ns"]
+    assert int(begun) * 1e-9 - table[0, 0] == pytest.approx(0.8, abs=0.0025)
