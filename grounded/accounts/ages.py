@@ -23,14 +23,19 @@ import numpy as np
 from grounded.accounts.finding import Finding
 from grounded.accounts.kinematics import Row, kinematic_rows, per_step, pieces, turned
 from grounded.accounts.lag import (
-    COHERENT,
-    REPORTED_FROM,
-    SAME,
-    SURELY,
     Lag,
     at_samples,
     earlier,
     lag_between,
+)
+from grounded.accounts.levels import (
+    FEWEST_SAMPLES,
+    GROSS,
+    NEARLY_ALL,
+    PART,
+    REPORTED_FROM,
+    SLIGHT,
+    SURELY,
 )
 from grounded.accounts.signals import quantum
 from grounded.accounts.table import RPM
@@ -46,9 +51,7 @@ LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamp
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
 PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
-CARRIED = 0.75  # of the noise that the weights take from the position: more is another's
-STRETCHES, SHORTEST = 24, 4  # least number of stretches for a bias, and steps in one
-UNSURE = 0.25  # of a delay: a larger uncertainty, or remainder, of two positions shows none
+SHORTEST = 4  # steps in a stretch for a bias
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
 
 
@@ -96,7 +99,7 @@ class Ages:
             if not pair <= {*self.shown} or (adopted and not one.exact):
                 continue
             lag = lag_of(self.model, relation, self.trials)
-            clear = lag if lag is not None and lag.coherence > COHERENT else None
+            clear = lag if lag is not None and lag.coherence > NEARLY_ALL else None
             if clear and (found := self.derived(relation, clear)):
                 if not adopted:
                     yield from self.late(relation, clear)
@@ -194,7 +197,7 @@ class Ages:
         Around a stop it is wrong for as long as it averages.
         """
         q, w = (self.names[k] for k in (relation.i, relation.j))
-        if abs(found.gain - 1) + SURELY * found.gain_std < SAME:
+        if abs(found.gain - 1) + SURELY * found.gain_std < SLIGHT:
             self.rule_out(q, w)
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
         self.shown.remove(relation.j)
@@ -209,9 +212,9 @@ class Ages:
         """
         bias, std, rms = bias_of(self.model, relation, self.trials)
         q, w = (self.names[k] for k in (relation.i, relation.j))
-        if abs(bias) < SURELY * std and REPORTED_FROM * std < 2 * SAME * rms:
+        if abs(bias) < SURELY * std and REPORTED_FROM * std < 2 * SLIGHT * rms:
             self.refuted |= {f"sensor_bias:{w}"} | self.of_position("offset", q, w)
-        elif abs(bias) > max(REPORTED_FROM * std, SAME * rms):
+        elif abs(bias) > max(REPORTED_FROM * std, SLIGHT * rms):
             size, way = Quantity(abs(bias), self.model.states[w]), "more" if bias > 0 else "less"
             yield Finding(w, found_("sensor.scale", w, size=size, way=way, of=q), "offset")
 
@@ -329,7 +332,7 @@ def _weighed(
     left = float(np.sqrt(rest @ rest / count))
     # the velocity must carry the position's noise as its weights would
     passed = noise * float(np.linalg.norm(np.diff(np.pad(weights, 1)))) / dt
-    explained = left < CARRIED * passed
+    explained = left < GROSS * passed
     gain = float(weights.sum())
     if rank < length or not explained or abs(gain - 1) > OFF:
         return None
@@ -355,10 +358,10 @@ def bias_of(
     steps, rows = sum(len(moved) for _, moved, _ in whole), list[tuple[float, float, int]]()
     for _, moved, w in whole:
         off = 0.5 * (w[1:] + w[:-1]) - moved / dt
-        parts = max(1, min(-(-STRETCHES * len(off) // steps), len(off) // SHORTEST))
+        parts = max(1, min(-(-FEWEST_SAMPLES * len(off) // steps), len(off) // SHORTEST))
         for some in np.array_split(np.arange(len(off)), parts):
             rows.append((float(moved[some].mean()) / dt, float(off[some].mean()), len(some)))
-    if len(rows) < STRETCHES // 2 or not np.ptp([rate for rate, *_ in rows]):
+    if len(rows) < FEWEST_SAMPLES // 2 or not np.ptp([rate for rate, *_ in rows]):
         return np.nan, np.nan, np.nan
     rates, offs, counts = np.array(rows).T
     (_, bias), spread = np.polyfit(rates, offs, 1, w=np.sqrt(counts), cov=True)
@@ -386,12 +389,12 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
     dt, columns, units = trials[0].dt, [row.i for row in both], list(model.states.values())
     ways = [(z[:, columns], s[:, columns]) for t in trials for z, s in per_step(model, t, both)]
     lag = lag_between([(said[:, k], moved[:, k]) for k in (0, 1) for moved, said in ways], dt)
-    if lag is None or lag.sign < 0 or lag.coherence < COHERENT:
+    if lag is None or lag.sign < 0 or lag.coherence < NEARLY_ALL:
         return None
     apart = len({j for row in both for j in row.by if units[j].endswith("/s")}) < 2
     least = max(REPORTED_FROM * lag.std, 0.5 * dt)
     left = _left(ways, lag.delay / dt, dt, apart=apart) if lag.delay >= least else [(0.0, np.inf)]
-    sure = all(max(std, abs(late) - SURELY * std) < UNSURE * lag.delay for late, std in left)
+    sure = all(max(std, abs(late) - SURELY * std) < PART * lag.delay for late, std in left)
     return lag if sure else None
 
 

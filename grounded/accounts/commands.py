@@ -20,13 +20,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.finding import UnusableTrials
+from grounded.accounts.levels import FACTOR, FEWEST_SAMPLES, HALF, HINT, MARGIN, PART
 from grounded.accounts.motion import (
     AHEAD_S,
-    FEWEST_SAMPLES,
-    HALF_ERROR,
-    HINT,
-    LIKE,
-    MARGIN,
     Ahead,
     Fit,
     basis,
@@ -42,8 +38,6 @@ from grounded.trial import Trial
 HORIZONS = (AHEAD_S, 1.0)  # [s] how far ahead an input is judged
 EARLY_S, REACH_S, GRID_S = 0.1, 1.0, 0.05  # [s] smallest and largest shift; calibrated near it
 STARTS = 120  # samples to predict from
-SHARES = (0.4, 2.5)  # of the modelled effect: an input acts as in the model, or in reverse
-OWN = 0.3  # share of an input's effect that the states do not foretell, from which on it is judged
 
 
 def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
@@ -83,7 +77,7 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
 
     def as_told(k: int) -> Fit:
         free = ahead.best([ones], late=-k)
-        like = ((free.gains > 1 / LIKE) & (free.gains < LIKE)).all()
+        like = ((free.gains > 1 / FACTOR) & (free.gains < FACTOR)).all()
         return free if like else ahead.best([ones], free=False, late=-k)
 
     with np.errstate(all="ignore"):
@@ -102,7 +96,7 @@ def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | 
         # all that past and present commands can do
         before = ahead.whatever_commands_do().best([ones])
     parts, gain = fits[k].rms / before.rms, before.score - fits[k].score
-    if gain < MARGIN or parts.min() > HALF_ERROR:
+    if gain < MARGIN or parts.min() > HALF:
         return None
     names, state = names_of(model, seen), min(seen, key=lambda i: float(parts[i]))
     name = model.state_names[state]
@@ -180,7 +174,7 @@ def _scores(ahead: Ahead) -> tuple[Array, Array]:
         by = off[:1] - off[1 : m + 1]  # what each input does (m, N, k)
         bent = off[:1] - off[m + 1 :] - 2 * by
         size = np.square(by / ahead.least).sum(axis=(0, 2))
-        even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= HALF_ERROR**2 * size
+        even = np.square(bent / ahead.least).sum(axis=(0, 2)) <= HALF**2 * size
         even &= np.isfinite(off).all(axis=(0, 2))
         if even.sum() < FEWEST_SAMPLES:
             continue
@@ -189,7 +183,7 @@ def _scores(ahead: Ahead) -> tuple[Array, Array]:
         own = each - np.einsum("nc,xck->xnk", linear, np.einsum("nc,xnk->xck", linear, each))
         moved = np.square((each - each.mean(axis=1, keepdims=True)) / ahead.least).sum(axis=(1, 2))
         alone = np.sqrt(np.square(own / ahead.least).sum(axis=(1, 2)) / moved)[1:]
-        for j in np.flatnonzero(alone > OWN).tolist():
+        for j in np.flatnonzero(alone > PART).tolist():
             tried = [_left(ahead, own, j, share) for share in (1.0, 0.0, -1.0)]
             nats[j] = np.fmin(nats[j], [score for score, _ in tried])
             if (best := _left(ahead, own, j, None))[0] < least[j]:
@@ -226,7 +220,7 @@ def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
     nats, share = known[next((k for k, lead in enumerate(leads) if lead > HINT), 0)]
     way = int(nats.argmin())
     agree = min(float(one[2 - way] - one[way]) for one, _ in known)
-    sized = SHARES[0] < (1 - way) * share < SHARES[1]
+    sized = 1 / FACTOR < (1 - way) * share < FACTOR
     clear = way != 1 and max(leads) > HINT and agree > HINT * (way == 2)
     return Acts(1 - way if clear and sized else 0, float(share))
 

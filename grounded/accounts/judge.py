@@ -16,12 +16,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.accounts.kinematics import Gap, Row, away, gaps, kinematic_rows, turned
+from grounded.accounts.levels import EXPLAINED, FACTOR, HALF, HINT, MARGIN, PART, SMALL
 from grounded.accounts.motion import (
-    FLOOR,
-    HALF_ERROR,
-    HINT,
-    LIKE,
-    MARGIN,
     SHORTLIST,
     Ahead,
     Fit,
@@ -34,9 +30,7 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
 
-BAD = 0.4  # share of a row's motion that is unexplained: from here on it is examined
-BETTER = 3.0  # factor by which its share must fall to be mended
-OF_A_UNIT, OF_GROSS = 0.015, 0.1  # tolerance of a unit's ratio, and of one of a gross factor
+OF_A_UNIT = 0.015  # tolerance of its ratio
 JUDGED_S = 0.5  # [s] of predictions
 SNAPPED = np.deg2rad(4)  # a heading that is off by a right angle
 TRIALS, STARTS = 4, 40  # trials, and samples of each, that predictions are made from
@@ -111,7 +105,7 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
 
 
 def _bad(found: Mapping[Row, Gap]) -> list[Row]:
-    return [row for row, gap in found.items() if gap.share > BAD]
+    return [row for row, gap in found.items() if gap.share > PART]
 
 
 def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
@@ -213,9 +207,9 @@ class _ByRows:
         size = np.array([_spread(trial.states, about=0.0) for trial in trials])
         noise = np.array([white_noise(trial.states) for trial in trials])
         dead = np.all(size <= NOISE_ALONE * noise + 1e-299, axis=0)
-        for row in (row for row, gap in before.items() if gap.share > HALF_ERROR):
+        for row in (row for row, gap in before.items() if gap.share > HALF):
             alone = len(row.by) == 1 or self.units[row.i] in ("rad", "deg")
-            for j in row.by if alone and before[row].varying > BAD else ():
+            for j in row.by if alone and before[row].varying > PART else ():
                 if self.units[j].endswith("/s") and dead[j]:
                     yield Account("dead", (j,))
 
@@ -272,12 +266,12 @@ def _spread(x: Array, about: float | None = None) -> Array:
 
 
 def _nats(gap: Gap) -> float:
-    return float(np.log(max(gap.share, FLOOR)))
+    return float(np.log(max(gap.share, SMALL)))
 
 
 def _agrees(before: Gap, after: Gap) -> bool:
     """Check whether a row that an account touches is mended, or stays good."""
-    return after.share <= (before.share / BETTER if before.share > BAD else BAD)
+    return after.share <= (before.share / FACTOR if before.share > PART else PART)
 
 
 def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
@@ -286,7 +280,7 @@ def _of_this_size(account: Account, after: Mapping[Row, Gap]) -> bool:
     ratio = sum(gap.power * gap.ratio for gap in after.values()) / max(power, 1e-300)
     gross = abs(np.log(abs(account.factor))) > np.log(RPM)
     off = abs(np.log(max(ratio, 1e-9)))
-    return account.kind != "unit" or bool(off < (OF_GROSS if gross else OF_A_UNIT))
+    return account.kind != "unit" or bool(off < (EXPLAINED if gross else OF_A_UNIT))
 
 
 # --- by motion ------------------------------------------------------------------------------------
@@ -392,7 +386,7 @@ def _compared(
     free = mended.best([ones])
     sent = [k - model.n for k in account.touched if k >= model.n]
     size = np.abs(np.log(np.maximum(free.gains[sent], 1e-9)))
-    if (size > (abs(np.log(account.factor)) / 3 if unit else np.log(LIKE))).any():
+    if (size > (abs(np.log(account.factor)) / 3 if unit else np.log(FACTOR))).any():
         return None  # the inputs act otherwise than in the model
     after = mended.best([ones], free=False) if unit else free
     if unit:
@@ -400,4 +394,4 @@ def _compared(
     else:
         before = logged.best([ones, -ones, 0.0 * ones, *(ones - 2 * np.eye(model.m))])
     better = before.missed - after.missed > MARGIN + account.price
-    return (before, after) if better and (after.share < HALF_ERROR * before.share).any() else None
+    return (before, after) if better and (after.share < HALF * before.share).any() else None

@@ -18,15 +18,13 @@ from typing import NamedTuple
 import numpy as np
 
 from grounded import places
+from grounded.accounts.levels import FINE, PART, STEPS_TO_JUDGE
 from grounded.frozen import Array, wrapped
 from grounded.model import Model
 from grounded.trial import Trial, stretches
 
 INSTANT_S = 1e-6  # [s] time step from which rates are computed
 STRETCH = 0.3  # [s] shortest stretch
-FEWEST_STRETCHES = 8  # stretches that a trial must hold
-NOISE = 0.3  # noise relative to the displacement over a stretch, above which a row is ignored
-ZERO_RATE = 1e-4  # of a rate, or of its largest derivative: treated as zero
 
 
 @dataclass(frozen=True)
@@ -83,7 +81,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     slopes = (f_x - np.eye(model.n)) / dt
     fast = np.array([unit.endswith("/s") for unit in model.states.values()])
     rates, doubled = (_rates(model, z) for z in (x, np.where(fast, 2 * x, x)))
-    size = ZERO_RATE * np.abs(rates).max(axis=0)
+    size = FINE * np.abs(rates).max(axis=0)
     fixed = np.abs(f_u).max(axis=(0, 2)) / dt < size
     low, high = np.ones((2, model.n))
     for k, one in enumerate(model.params.values()):
@@ -100,7 +98,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
     fixed &= ~fast & (np.ptp(doubled - 2 * rates, axis=0) < size)
     for i in (i for i in shown if i < model.n):
         slope = np.abs(slopes[:, i]).max(axis=0)
-        by = tuple(int(j) for j in np.flatnonzero(slope > ZERO_RATE * slope.max()))
+        by = tuple(int(j) for j in np.flatnonzero(slope > FINE * slope.max()))
         if fixed[i] and i not in by and {*by} <= {*shown}:
             found.append(Row(i, by, 0.0, float(low[i]), float(high[i])))
     return found
@@ -121,8 +119,8 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
         each = per_step(model, trial, some)
         moved, said = ([np.cumsum(z[k], axis=0) for z in each] for k in (0, 1))
         longest = max((len(x) for x in moved), default=0)
-        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // FEWEST_STRETCHES))
-        while usable := [k for k, x in enumerate(moved) if len(x) > FEWEST_STRETCHES * steps]:
+        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // STEPS_TO_JUDGE))
+        while usable := [k for k, x in enumerate(moved) if len(x) > STEPS_TO_JUDGE * steps]:
             far, told = (
                 np.concatenate([z[k][steps:] - z[k][:-steps] for k in usable])
                 for z in (moved, said)
@@ -160,7 +158,7 @@ def _over(
     for row in rows:
         i, same = row.i, [one.i for one in rows if units[one.i] == units[row.i]]
         size = float(max(moved[i], said[i], np.sqrt((said[same] ** 2).mean())))
-        if size > 0 and noise[i] < NOISE * size:
+        if size > 0 and noise[i] < PART * size:
             ratio = float(both[i] / max(power[i], 1e-300))
             yield row, Gap(off[i] / size, varying[i] / size, off[i] / length, ratio, power[i])
 

@@ -16,19 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from grounded.accounts.levels import FEWEST_SAMPLES, NEARLY_ALL, SLIGHT, SURELY
 from grounded.frozen import Array
 
 Pairs = Sequence[tuple[Array, Array]]
 
 LARGEST_DELAY_S, LARGEST_DELAY_STEPS = 0.3, 6  # the larger of both is tried
 WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samples
-SHORTEST = 24  # samples in the shortest pair used
-COHERENT = 0.9  # coherence below which a window is ignored
-BLOCKS = 16  # least number of blocks; the scatter over them gives the uncertainty
-REPORTED_FROM = 5.0  # standard deviations above which a delay or a bias is reported
-SAME = 0.01  # scale error that matters
-SURELY = 3.0  # standard deviations by which the scale must be certain
-FILTER = 0.9  # of a delay's misfit: what a filter leaves
 
 
 @dataclass(frozen=True)
@@ -73,9 +67,9 @@ class Lag:
 
     @property
     def one_size(self) -> bool:
-        """Whether both have one sign and one size: within SAME for certain, and perhaps equal."""
+        """Whether both have one sign and one size: within SLIGHT for certain, and perhaps equal."""
         off, sure = max(1 - self.low, self.high - 1), SURELY * self.scale_std
-        return self.sign > 0 and off < max(SAME / 3, sure) and off + sure < SAME
+        return self.sign > 0 and off < max(SLIGHT / 3, sure) and off + sure < SLIGHT
 
 
 def lag_between(pairs: Pairs, dt: float) -> Lag | None:
@@ -93,12 +87,14 @@ def lag_between(pairs: Pairs, dt: float) -> Lag | None:
     reach = max(3, min(most, longest // 8))
     found = [_smoothed(pairs, h, reach) for h in WINDOWS if 2 * h + 2 * reach < longest / 2]
     every = [(p, one) for p in found if (one := _measured(p, dt)) is not None]
-    clear = [(p, one) for p, one in every if one.coherence > COHERENT]
+    clear = [(p, one) for p, one in every if one.coherence > NEARLY_ALL]
     if not clear:
         return max((one for _, one in every), key=lambda lag: lag.coherence, default=None)
     best = min((one for _, one in clear), key=lambda lag: lag.std)
     apart = float(np.median([abs(one.delay - best.delay) for _, one in clear]))
-    told = [one.scale for p, one in clear if p.windows >= BLOCKS // 2]  # few windows scatter a lot
+    told = [
+        one.scale for p, one in clear if p.windows >= FEWEST_SAMPLES // 2
+    ]  # few windows scatter a lot
     return replace(best, std=float(np.hypot(best.std, apart)), slow=told[-1] if told else np.nan)
 
 
@@ -122,8 +118,8 @@ class _Pieces:
         Parts are stretches of time, or of one place in every piece: the larger one counts.
         """
         lengths = [len(a) for a in self.a]
-        total = np.arange(sum(lengths)) * max(BLOCKS, 2 * len(lengths)) // sum(lengths)
-        place = np.concatenate([np.arange(n) * BLOCKS // (2 * n) for n in lengths])
+        total = np.arange(sum(lengths)) * max(FEWEST_SAMPLES, 2 * len(lengths)) // sum(lengths)
+        place = np.concatenate([np.arange(n) * FEWEST_SAMPLES // (2 * n) for n in lengths])
         return max(float(np.linalg.norm(np.bincount(group, force))) for group in (total, place))
 
     @property
@@ -135,7 +131,7 @@ class _Pieces:
 def _smoothed(pairs: Pairs, h: int, reach: int) -> _Pieces:
     window = np.hanning(2 * h + 3)[1:-1]
     window /= window.sum()
-    long = [(a, b) for a, b in pairs if len(a) >= max(SHORTEST, 2 * (h + reach) + 4)]
+    long = [(a, b) for a, b in pairs if len(a) >= max(FEWEST_SAMPLES, 2 * (h + reach) + 4)]
     a, b = ([np.convolve(pair[k], window, "valid") for pair in long] for k in (0, 1))
     return _Pieces([one[reach:-reach] for one in a], b, reach, h)
 
@@ -189,7 +185,7 @@ def _filter(pieces: _Pieces, a: Array, misfit: float) -> tuple[float, Array] | N
     columns = np.stack([b, slope], axis=1)
     s, both = np.linalg.lstsq(columns, a, rcond=None)[0]
     rest = float(((a - columns @ [s, both]) ** 2).sum())
-    better = rest < FILTER * misfit and both / s > 0
+    better = rest < NEARLY_ALL * misfit and both / s > 0
     return (float(both / s), b + both / s * slope) if better else None
 
 

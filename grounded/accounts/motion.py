@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.accounts.levels import EXACT, FEWEST_SAMPLES, SMALL, TINY
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import motion, true_values
@@ -24,18 +25,10 @@ from grounded.trial import Trial
 
 AHEAD_S = 0.25  # [s]
 STATES_BOUND = 1e9  # bound on predicted states
-FLOOR = 0.05  # of a motion: smaller errors count as this
 DELAYS = tuple(np.linspace(0.0, 0.3, 7).tolist())  # [s] command delays tried
-FEWEST_SAMPLES = 20  # fewest samples
-# smallest error that counts: of a state's spread, and in its unit
-SMALLEST_ERROR, TINY = 1e-3, 1e-12
 ROUNDS, SLOPE = 5, 0.02  # iterations, difference step
 SAME = 1e-6  # singular values below this share of the largest count as zero
-MARGIN = 0.8  # [nats] by which any account must lead the others: the one margin
 SHORTLIST = 8  # accounts of a table that are compared in full
-HINT = MARGIN / 2  # [nats] of plain predictions that are looked at
-HALF_ERROR = 0.5  # share of one error
-LIKE = 4.0  # factor within which an input must act as in the model
 
 Steps = NDArray[np.intp]
 
@@ -91,7 +84,7 @@ class Fit:
     @property
     def share(self) -> Array:
         """Share of each state's motion that is missed (n,), at most 1: nothing is predicted."""
-        return np.asarray(np.clip(self.rms / np.maximum(self.moved, TINY), FLOOR, 1.0))
+        return np.asarray(np.clip(self.rms / np.maximum(self.moved, TINY), SMALL, 1.0))
 
     @property
     def missed(self) -> float:
@@ -139,7 +132,7 @@ class Ahead:
         self.left_out = basis(self.first[:, self.shown] if linear else self.first[:, :0])
         self.left_out = self.left_out if constant else self.left_out[:, :0]
         moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
-        self.least = SMALLEST_ERROR * moves + TINY
+        self.least = EXACT * moves + TINY
         params = list(model.params.values())
         self.moving = [k for k, param in enumerate(params) if param.uncertain]
         self.spread = np.array([params[k].spread for k in self.moving])
@@ -293,9 +286,9 @@ def plainly_missed(ahead: Ahead, versions: Array) -> Array:
     off = model.difference(now.reshape(first.shape), last)[..., shown]
     moved = model.difference(last, first)[..., shown].std(axis=1)
     size = np.sqrt(off.var(axis=1))  # a constant rate is removed
-    least = SMALLEST_ERROR * x[..., shown].std(axis=1, where=np.isfinite(x[..., shown])) + TINY
+    least = EXACT * x[..., shown].std(axis=1, where=np.isfinite(x[..., shown])) + TINY
     size = np.maximum(np.where(np.isfinite(size), size, STATES_BOUND), least)
-    share = np.clip(size / np.maximum(moved, TINY), FLOOR, 1.0)
+    share = np.clip(size / np.maximum(moved, TINY), SMALL, 1.0)
     return np.asarray(np.log(share).sum(axis=-1))
 
 

@@ -19,18 +19,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from grounded.accounts.motion import MARGIN, SHORTLIST
-from grounded.accounts.reported import tables
-from grounded.accounts.sent import (
+from grounded.accounts.levels import (
     DECISIVE,
     EXACT,
     EXPLAINED,
     FINE,
+    HALF,
     LATEST,
-    SAME,
+    MARGIN,
+    PART,
     SLIGHT,
     STEPS_TO_JUDGE,
-    UNLIKE,
+)
+from grounded.accounts.motion import SHORTLIST
+from grounded.accounts.reported import tables
+from grounded.accounts.sent import (
     Following,
     Ran,
     apart,
@@ -498,7 +501,7 @@ def _held(own: Ran, trial: Trial) -> Iterator[Row]:
     lost = float(same[:T].mean())
     if unsent > LATEST:
         story = _passed("run.unsent", own, steps=unsent)
-    elif len(changed) >= STEPS_TO_JUDGE and lost > UNLIKE:
+    elif len(changed) >= STEPS_TO_JUDGE and lost > PART:
         every, dt = 1e3 * policy.dt * float(np.median(np.diff(changed))), 1e3 * policy.dt
         story = _passed("run.skipped", own, lost=lost, every=every, dt=dt)
     else:
@@ -582,7 +585,7 @@ def suspicion(
     alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]
     if sure := [one for one in alike if one[2] > DECISIVE]:
         left, name, nats = min(sure)
-        near = name if left < max(EXACT, SAME * ran.error) else ""
+        near = name if left < max(EXACT, HALF * ran.error) else ""
         return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
     some = cache(partial(stories, task, own, trial, ran, logged=logged))
     if ran.alike:

@@ -17,21 +17,14 @@ from typing import Protocol
 
 import numpy as np
 
+from grounded.accounts.levels import FINE, PART, STEPS_TO_JUDGE
 from grounded.frozen import Array, median, white_noise
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
 from grounded.trial import Trial
 
-STEPS_TO_JUDGE = 10  # smallest number of steps that can be judged
-UNLIKE = 0.25  # of the squared difference of unrelated commands; 1 - UNLIKE: concordance (Lin 1989)
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
-DECISIVE = 8.0  # [nats] of evidence that another candidate ran
-SAME = 0.5  # share of another difference that counts as none
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
-# differences of commands, relative to their size: none, hardly any, alike, explained
-EXACT, SLIGHT, RESEMBLES, EXPLAINED = 1e-3, 0.02, 0.05, 0.1
-LATEST = 3  # steps by which commands may be sent or logged late
-FINE = 1e-4  # resolution of logged commands at best, relative to an input's size
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
 # differences from the prediction, of a state's usual size: at most in any state of a run as planned
 # (a sign or a unit puts a column farther off); usual in a run like it (1.4 if unrelated)
@@ -106,7 +99,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = (with_noise - free[0]) ** 2  # at samples, where it is largest
-    room = np.maximum(UNLIKE * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
+    room = np.maximum(PART * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     drawn_out = np.array([max(1.0, steps_alike(column) / ROUGH) for column in (sent - asked).T])
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
     # somebody may take over: every part must be alike

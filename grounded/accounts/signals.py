@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.finding import Finding
-from grounded.accounts.motion import FEWEST_SAMPLES
+from grounded.accounts.levels import FEWEST_SAMPLES, NEARLY_ALL, STEPS_TO_JUDGE
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-STUCK = 8  # equal samples before a jump
-HELD = 0.8  # share of runs longer than one sample, above which the sensor is slower than the log
 FULL_TURNS = (2 * np.pi, 360.0)
 
 
@@ -88,30 +86,33 @@ def _share(gone: Sequence[Any]) -> float:
 
 
 def _wrapped(s: Signal) -> Found | None:
-    """Find jumps by a full turn, in radians or degrees, in an angle that should be in radians."""
-    for turn in FULL_TURNS if s.unit == "rad" else ():
-        steps = [np.diff(x) for x in s.columns]
-        jumps = [np.sign(d) * (np.abs(np.abs(d) - turn) < 0.1 * turn) for d in steps]
-        jumps = [np.nan_to_num(k) for k in jumps]
-        count, degrees = int(sum(np.abs(k).sum() for k in jumps)), turn == 360.0
-        if not count or np.quantile(s.changes, 0.9) > 0.2 * turn or (s.angle and not degrees):
-            continue
-        whole = [
-            (x - turn * np.concatenate([[0.0], np.cumsum(k)])) * (2 * np.pi / turn)
-            for x, k in zip(s.columns, jumps, strict=True)
-        ]
-        one = s.told("degrees" if degrees else "wrapped", mended=True, degrees=degrees, count=count)
-        keys: dict[str, Any] = {"scale": 0.017453293} if degrees else {}
-        scale = 180 / np.pi if degrees else 1.0
-        return replace(one, scale=scale, keys=keys | {"unwrap": True}), replace(s, columns=whole)
+    """Find jumps by a full turn, in radians or degrees, in an angle whose differences don't wrap.
+
+    Each log may have a unit of its own; which one it is, the accounts of units tell.
+    """
+    for turn in FULL_TURNS if s.unit == "rad" and not s.angle else ():
+        jumps = [_jumps(x, turn) for x in s.columns]
+        if count := int(sum(np.abs(k).sum() for k in jumps)):
+            ways = [turn * np.concatenate([[0.0], np.cumsum(k)]) for k in jumps]
+            whole = [x - way for x, way in zip(s.columns, ways, strict=True)]
+            one = s.told("wrapped", mended=True, count=count)
+            return replace(one, keys={"unwrap": True}), replace(s, columns=whole)
     return None
+
+
+def _jumps(x: Array, turn: float) -> Array:
+    """Return by how many turns the samples of a log (T + 1,) jump, (T,); 0 where it moves far."""
+    steps = np.diff(x)
+    size = np.abs(steps)
+    calm = np.quantile(size[size > 0], NEARLY_ALL) < 0.2 * turn if (size > 0).any() else False
+    return np.asarray(calm * np.nan_to_num(np.sign(steps) * (np.abs(size - turn) < 0.1 * turn)))
 
 
 def _dropouts(s: Signal) -> Found | None:
     """Find a fixed value that the signal jumps to for single samples."""
     if s.changes.size < FEWEST_SAMPLES:
         return None
-    far, values = 10 * float(np.quantile(s.changes, 0.9)), []
+    far, values = 10 * float(np.quantile(s.changes, NEARLY_ALL)), []
     for x in s.columns:
         there = (np.abs(x[1:-1] - x[:-2]) > far) & (np.abs(x[1:-1] - x[2:]) > far)
         values += list(x[1:-1][there & (np.abs(x[2:] - x[:-2]) < far)])
@@ -137,7 +138,7 @@ def _held(s: Signal) -> Found | None:
     if len(lengths) < FEWEST_SAMPLES or not s.changes.size:
         return None
     coarse = np.quantile(s.changes, 0.5) < 2.5 * s.changes.min()  # coarse quantisation
-    if coarse or np.mean(np.array(lengths) >= 2) < HELD:
+    if coarse or np.mean(np.array(lengths) >= 2) < NEARLY_ALL:
         return None
     one = s.told("held", _share(gone), mended=True, every=float(np.median(lengths)) * s.dt)
     return replace(one, mend=one.said), s.without(gone)
@@ -152,7 +153,7 @@ def _stuck(s: Signal) -> Found | None:
         flat = np.zeros(len(x), bool)
         for start, length in zip(*runs(x), strict=True):
             end = start + length
-            if length < STUCK or not start or end >= len(x):
+            if length < STEPS_TO_JUDGE or not start or end >= len(x):
                 continue
             onward = abs(x[end + 1] - x[end]) if end + 1 < len(x) else np.inf
             if abs(x[end] - x[start]) > max(far, 3 * onward):

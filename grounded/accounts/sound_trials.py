@@ -21,7 +21,7 @@ from grounded.accounts.commands import judge_clocks, judge_signs
 from grounded.accounts.finding import Finding, Preflight, UnusableTrials
 from grounded.accounts.judge import Verdict, judge
 from grounded.accounts.kinematics import Gap, gaps
-from grounded.accounts.motion import HALF_ERROR
+from grounded.accounts.levels import GROSS, HALF
 from grounded.accounts.reported import keys, names_of, reported
 from grounded.accounts.signals import judge_signal, signal_of
 from grounded.accounts.table import Told
@@ -32,8 +32,6 @@ from grounded.model import Model
 from grounded.result import per_second
 from grounded.task import Task
 from grounded.trial import Trial
-
-GROSS = 0.7  # unexplained share of a row's motion that is reported
 
 
 def sound_trials(
@@ -147,7 +145,7 @@ def _unexplained(
     for row in rows:
         some = [one[row] for one in every if row in one]
         gap = Gap(*np.median(some, axis=0)) if some else None
-        if gap is None or gap.share < GROSS or gap.varying < HALF_ERROR:
+        if gap is None or gap.share < GROSS or gap.varying < HALF:
             continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         off = Quantity(float(gap.rate), per_second(model.states[name]))

@@ -15,6 +15,7 @@ from itertools import combinations, product
 
 import numpy as np
 
+from grounded.accounts.levels import SMALL
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
@@ -42,7 +43,7 @@ UNITS: dict[str, dict[str, float]] = {
 }
 FULL = {"percent": 100.0, "counts of 8 bits": 255.0, "thousandths": 1000.0}  # full scale of a part
 WORDS = {"deg": "degrees", "deg/s": "degrees a second", "rad": "radians"}
-OPENED, OVER = 0.05, 1.03  # share of full scale that the largest command of a log lies between
+OVER = 1.03  # share of full scale that the largest command of a log stays below
 PREFIXES = ("m", "k", "c", "u", "M")
 
 
@@ -174,7 +175,7 @@ def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
     if unit in UNITS:
         return UNITS[unit]
     if unit == "1":
-        full = [(name, f) for name, f in FULL.items() if OPENED * f < most < OVER * f]
+        full = [(name, f) for name, f in FULL.items() if SMALL * f < most < OVER * f]
         return dict(full[:1])
     base = unit.partition("/")[0]
     if not base or " " in unit or "^" in unit or base[:1] in PREFIXES:

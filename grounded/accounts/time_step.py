@@ -1,4 +1,4 @@
-"""Tell when the integrator's step is too long for the model.
+"""Tell when the integrator's step is too long for the model, or for a motion in one trial.
 
 A fast motor, a stiff spring or dry friction over a narrow range of speed can be too fast for one
 step a control step: at a time constant of half a step, RK4 misses a fifth of the change. A fit
@@ -12,17 +12,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from grounded import findings as told
 from grounded.accounts.finding import Finding
-from grounded.findings import Quantity
+from grounded.accounts.levels import EXPLAINED, NEARLY_ALL, SLIGHT, SMALL
+from grounded.findings import Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
 
-# share of a state's change in a step, rms, that a step may miss; the same of finer ones; and of its
-# spread, in a single step
-MISSED, FINE, MISSES = 0.05, 0.01, 0.1
-USUAL = 0.95  # share of the samples that is compared, those with the smallest differences
 ROWS = 5_000  # samples that are compared
 PARTS = (2, 4, 8, 16, 32, 64)
 
@@ -35,60 +31,36 @@ def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int])
         trials: in the model's units.
         shown: indices of the states with a sensor; the others are taken as 0.
     """
-    x = np.concatenate([t.states[:-1] for t in trials])
-    u, hidden = np.concatenate([t.inputs for t in trials]), np.ones(model.n, bool)
-    hidden[list(shown)] = False
-    found = too_long(model, np.where(hidden, 0.0, x), u, trials[0].dt)
-    if found is None or hidden[model.state_names.index(found.about[0])]:
-        return []
-    return [Finding(found.about[0], found, "time step", mend=found)]
-
-
-def too_long(
-    model: Model, states: Array, inputs: Array, dt: float, file: str = "model.py"
-) -> told.Finding | None:
-    """Compare the model's step with finer ones.
-
-    Args:
-        model: the model; one without `derivative` takes its own steps and is not judged.
-        states: (N, n); rows that are not finite are left out.
-        inputs: (N, m), held over the step.
-        dt: control step [s].
-        file: of the model.
-
-    Returns:
-        By how much a step misses the worst state, and how many steps are enough; None if they are
-        short enough.
-    """
-    if model.derivative is None:
-        return None
-    known = np.flatnonzero(np.isfinite(states).all(axis=1) & np.isfinite(inputs).all(axis=1))
+    own, dt = np.isin(np.arange(model.n), shown), trials[0].dt
+    x = np.concatenate([np.where(own, trial.states[:-1], 0.0) for trial in trials])
+    u = np.concatenate([trial.inputs for trial in trials])
+    known = np.flatnonzero(np.isfinite(x).all(axis=1) & np.isfinite(u).all(axis=1))
     known = known[:: 1 + len(known) // ROWS]
-    if not len(known):
-        return None
-    x, u = states[known], inputs[known]
-    runs, enough = [after_a_step(model, x, u, dt, 1)], False
+    if model.derivative is None or not len(known):
+        return []
+    x, u = x[known], u[known]
+    # finer and finer, until it makes no difference
+    runs, enough = [_after_a_step(model, x, u, dt, 1)], False
     for parts in PARTS:
-        runs.append(after_a_step(model, x, u, dt, parts))
-        enough = bool(_missed(model, x, runs[-2], runs[-1]).max() <= FINE)
-        if enough:
+        runs.append(_after_a_step(model, x, u, dt, parts))
+        if enough := bool(_missed(model, x, runs[-2], runs[-1]).max() <= SLIGHT):
             break
     missed = _missed(model, x, runs[0], runs[-1])
     worst = int(np.argmax(missed))
-    if not missed[worst] > MISSED:
-        return None
-    own = model.substeps
-    return told.found(
+    if not missed[worst] > SMALL or not own[worst]:
+        return []
+    said = found(
         "plan.time_step",
         model.state_names[worst],
         share=float(missed[worst]),
-        step=Quantity(1e3 * dt / own, "ms"),
-        substeps=own * 2 ** (len(runs) - 2) if enough else 0,
-        file=file,
+        step=Quantity(1e3 * dt / model.substeps, "ms"),
+        substeps=model.substeps * 2 ** (len(runs) - 2) if enough else 0,
+        file="model.py",
     )
+    return [Finding(model.state_names[worst], said, "time step", mend=said)]
 
 
-def after_a_step(model: Model, x: Array, u: Array, dt: float, parts: int) -> Array:
+def _after_a_step(model: Model, x: Array, u: Array, dt: float, parts: int) -> Array:
     """Return the states (N, n) after a control step that is made in so many parts."""
     with np.errstate(all="ignore"):
         for _ in range(parts):
@@ -96,16 +68,16 @@ def after_a_step(model: Model, x: Array, u: Array, dt: float, parts: int) -> Arr
     return np.asarray(x)
 
 
-def _missed(model: Model, x: Array, one: Array, finer: Array) -> Array:
+def _missed(model: Model, x: Array, once: Array, finer: Array) -> Array:
     """Return the difference of two results, relative to the change in the step, rms, (n,).
 
     The largest differences are left out: a few samples of a fall say nothing about the others.
     """
     with np.errstate(all="ignore"):
-        off, change = model.difference(one, finer) ** 2, model.difference(finer, x) ** 2
+        off, change = model.difference(once, finer) ** 2, model.difference(finer, x) ** 2
         known = np.isfinite(off).any(axis=0)  # else it overflowed everywhere
         off[:, ~known] = change[:, ~known] = 0.0
-        usual = ~(off > np.nanquantile(off, USUAL, axis=0))
+        usual = ~(off > np.nanquantile(off, NEARLY_ALL, axis=0))
         off, change = (np.nanmean(np.where(usual, y, np.nan), axis=0) ** 0.5 for y in (off, change))
         least = 1e-6 * np.nanmax(np.abs(x), axis=0) + 1e-12  # of a state that stands still
         return np.nan_to_num(np.where(change > least, off / change, 0.0), posinf=0.0)
@@ -131,14 +103,15 @@ def judge_resolution(
     usual = np.median([x.std(axis=0) for x in states], axis=0)
     cut = dict[int, tuple[int, int]]()
     for k, (trial, x) in enumerate(zip(trials, states, strict=True)):
-        once, twice = (after_a_step(model, x[:-1], trial.inputs, trial.dt, n) for n in (1, 2))
+        once, twice = (_after_a_step(model, x[:-1], trial.inputs, trial.dt, n) for n in (1, 2))
         off = np.abs(model.difference(once, twice)) / np.where((usual > 0) & own, usual, np.inf)
-        if (off := np.nan_to_num(off)).max(initial=0.0) > MISSES:
-            keep = int((off.max(axis=1) > MISSES).argmax())
+        off = np.nan_to_num(off)
+        if (far := (off > EXPLAINED).any(axis=1)).any():
+            keep = int(far.argmax())
             cut[k] = keep, int(off[keep].argmax())
     for k, (keep, worst) in cut.items() if 2 * len(cut) < len(trials) else ():
         (name, unit), trial = list(model.states.items())[worst], trials[k]
-        said = told.found(
+        said = found(
             "sensor.unresolved",
             name,
             reach=Quantity(float(np.abs(states[k][:, worst]).max()), unit),

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from grounded.accounts.commands import STARTS, Acts, how_inputs_act
-from grounded.accounts.motion import HALF_ERROR, MARGIN, Ahead
+from grounded.accounts.levels import HALF, MARGIN
+from grounded.accounts.motion import Ahead
 from grounded.findings import Finding, found
 from grounded.search.planner import Planner
 from grounded.trial import Trial
@@ -42,7 +43,7 @@ def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding |
         plain, *turned = [ahead.size(one) for one in each]
         nats = [float(np.log(plain / one).sum()) for one in turned]
         j = int(np.argmax(nats))
-        shares = np.where(turned[j] > HALF_ERROR * ahead.moved, 1.0, turned[j] / plain)[own]
+        shares = np.where(turned[j] > HALF * ahead.moved, 1.0, turned[j] / plain)[own]
     i = int(np.argmin(shares))
     if nats[j] < 2 * MARGIN or shares[i] > LEFT_BY_FLIP:
         return None

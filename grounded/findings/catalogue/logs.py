@@ -365,9 +365,9 @@ SENSOR: dict[str, Entry] = {
         "it was probably converted from rpm by mistake]][[!rpm? ; either may be wrong]]",
     ),
     "samples": warn(
-        "[[degrees? is in degrees: ]][[jumps by a full turn {count:time}]][[drops to {low} for "
-        "single samples]][[has a new value only every {every:.3g} s]][[sticks to its last value, "
-        "up to {stuck:.3g} s at a time, and then jumps]][[ ({share:%})]]",
+        "[[jumps by a full turn {count:time}]][[drops to {low} for single samples]][[has a new "
+        "value only every {every:.3g} s]][[sticks to its last value, up to {stuck:.3g} s at "
+        "a time, and then jumps]][[ ({share:%})]]",
     ),
     "mismatch": warn("does not move as {of} {of:implies/imply} (its rate is off by {off})"),
     "unresolved": warn(

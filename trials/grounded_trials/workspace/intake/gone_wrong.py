@@ -31,11 +31,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.accounts.levels import HALF, LATEST, STEPS_TO_JUDGE
 from grounded.accounts.sent import (
-    LATEST,
-    SAME,
-    STEPS_TO_JUDGE,
-    UNLIKE,
     as_planned,
     follows,
     latest,
@@ -144,11 +141,11 @@ class Run:
         some = stories(task, self.own, self.run, ran)
         if some and some[0].kind is Kind.PROGRAM:
             return some[0].finding
-        if ran is None or not (ran.alike and ran.late and ran.moved < UNLIKE):
+        if ran is None or not (ran.alike and ran.late and ran.moved < HALF**2):
             return None
         # the states acted on show a wrong start
         late, side = ran.late, "late" if ran.late > 0 else "early"
-        start = late < 0 or ran.age <= SAME * late
+        start = late < 0 or ran.age <= HALF * late
         what = "start" if start else "either"
         return found("log.late", ran=self.own.id, steps=abs(late), side=side, what=what)
 

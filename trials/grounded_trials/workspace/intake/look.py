@@ -13,14 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from grounded.accounts.levels import DECISIVE, EXACT, EXPLAINED, FINE, LATEST, SMALL, STEPS_TO_JUDGE
 from grounded.accounts.sent import (
-    DECISIVE,
-    EXACT,
-    EXPLAINED,
-    FINE,
-    LATEST,
-    RESEMBLES,
-    STEPS_TO_JUDGE,
     Following,
     evidence,
     follows,
@@ -86,7 +80,7 @@ def sender_of(
         if (start is None or not start.alike) and (begun := start_of(one)) and begun.opens_alike:
             at = begun.seconds
         fit = None if one.id == own.id else acted_on(log, one.policy, at)
-        if fit is None or fit.left > RESEMBLES:
+        if fit is None or fit.left > SMALL:
             continue
         T = min(len(mine.asked), len(fit.asked))
         differ = np.sqrt((((mine.asked[:T] - fit.asked[:T]) / mine.size) ** 2).mean())

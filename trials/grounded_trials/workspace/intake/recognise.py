@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.accounts.levels import FINE, SMALL
 from grounded.accounts.reported import scaled as scaled_columns
 from grounded.accounts.returned import (
     OTHERS,
@@ -30,7 +31,7 @@ from grounded.accounts.returned import (
     suspicion,
     unit_by_factor,
 )
-from grounded.accounts.sent import FINE, RESEMBLES, follows, latest
+from grounded.accounts.sent import follows, latest
 from grounded.accounts.table import Account
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
@@ -155,7 +156,7 @@ class Case:
             return replace(seen, why=None, other="")
         if sender.other:
             return replace(seen, why=sender.why, other=sender.other)
-        if start and self.guessed and seen.why and sender.own and sender.own.left < RESEMBLES:
+        if start and self.guessed and seen.why and sender.own and sender.own.left < SMALL:
             # a program that differentiates positions has speeds that lag the estimated ones
             self._cut(stored, start)
             return replace(self._judged(), why=None, other="")
@@ -458,10 +459,8 @@ def of_earlier_task(workspace: Folder, log: Recording | None, trial: Trial) -> S
     for one in reversed(void[-OTHERS:]):
         start = log.start_of(one.policy) if log else None
         fit = None if log else follows(one.policy, trial.until(one.policy.horizon), latest(task))
-        error = (
-            start.apart if start and start.alike else fit.error if fit and fit.alike else RESEMBLES
-        )
-        if error < RESEMBLES:
+        error = start.apart if start and start.alike else fit.error if fit and fit.alike else SMALL
+        if error < SMALL:
             run = (log.trial_from(start.seconds) if log and start else None) or trial
             told = found("log.earlier", ran=one.id, was=other_task(task, one))
             some.append(scored(Kind.EARLIER, told, one, run, error, names=(one.id,)))

@@ -28,14 +28,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.accounts.sent import EXACT as TO_DIGITS
+from grounded.accounts.levels import EXACT as TO_DIGITS
+from grounded.accounts.levels import FINE, HALF, PART, SLIGHT, SMALL, STEPS_TO_JUDGE
 from grounded.accounts.sent import (
-    FINE,
-    RESEMBLES,
-    SAME,
-    SLIGHT,
-    STEPS_TO_JUDGE,
-    UNLIKE,
     WINDOWS,
     follows,
 )
@@ -167,7 +162,7 @@ class Recording:
         likeliest = min(alike or starts, key=lambda one: one.apart, default=None)
         if likeliest is None:
             return None
-        near = [one for one in starts if SAME * one.apart <= likeliest.apart] if alike else []
+        near = [one for one in starts if HALF * one.apart <= likeliest.apart] if alike else []
         if len(near) == 1:
             return likeliest
         fits = [(acted_on(self, policy, one.seconds), one) for one in near or [likeliest]]
@@ -177,7 +172,7 @@ class Recording:
             rival = self._rival(best, [one for fit, one in told if fit.throughout])
             return replace(best, alike=True, opens_alike=True, exact=True, rival_s=rival)
         usual = next((other.left for other, one in told if one is likeliest), 0.0)
-        if fit is not None and alike and fit.left < SAME * usual:
+        if fit is not None and alike and fit.left < HALF * usual:
             return replace(best, opens_alike=True)
         return replace(likeliest, rival_s=self._rival(likeliest, near)) if alike else None
 
@@ -202,7 +197,7 @@ class Recording:
             told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
             if fit is None or len(told) < STEPS_TO_JUDGE:
                 return np.inf
-            moves = bool((np.ptp(fit.asked[told], axis=0) > RESEMBLES * fit.size).any())
+            moves = bool((np.ptp(fit.asked[told], axis=0) > SMALL * fit.size).any())
             return float(np.median(fit.off[told])) if moves else np.inf
 
         tried, left = dict[float, float](), strays.copy()
@@ -230,7 +225,7 @@ class Recording:
         misfits = [self._misfit(policy, first - k * self.dt) for k in range(1, MISSED + 1)]
         missed = int(np.argmin(misfits)) + 1
         at = first - missed * self.dt
-        there, least = acted_on(self, policy, at), UNLIKE * (usual.left if usual else 0.0)
+        there, least = acted_on(self, policy, at), PART * (usual.left if usual else 0.0)
         if there is None or there.told.sum() < STEPS_TO_JUDGE or there.left > max(least, TO_DIGITS):
             return None
         return Start(at, found.apart if found else np.inf, True, True, missed=missed)
