@@ -10,7 +10,7 @@ an account must stay near the model's: a model that is only wrong gains nothing 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,9 +22,8 @@ from grounded.accounts.motion import (
     Ahead,
     Fit,
     known_states,
-    plainly_missed,
 )
-from grounded.accounts.table import RPM, Account, Term, Told, accounts, versions
+from grounded.accounts.table import RPM, Account, Term, Told, accounts
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
@@ -90,15 +89,8 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
         shown: indices of the states with a sensor.
         account: the fault, of another trial.
     """
-    known, ones = known_states(trial, shown), np.ones(model.m)
-    logged, mended = (  # a command at its limit may make a constant rate
-        Ahead(model, one, known, 2 * STARTS, constant=False, horizon=JUDGED_S)
-        for one in (trial, account.mended(trial))
-    )
-    if not (logged.enough and mended.enough):
-        return False
     with np.errstate(all="ignore"):
-        return mended.plain(ones).missed - logged.plain(ones).missed > HINT
+        return _Seen(model, trial, (), shown).gain(account) < -HINT
 
 
 # --- by rows --------------------------------------------------------------------------------------
@@ -114,15 +106,6 @@ def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
     return {
         row: Gap(*np.sqrt(np.mean(np.square(some), axis=0)).tolist()) for row, some in each.items()
     }
-
-
-@dataclass(frozen=True)
-class _Best:
-    """The account that mends the rows of some trials best, and those as good."""
-
-    account: Account
-    gain: float
-    others: tuple[Account, ...]
 
 
 class _ByRows:
@@ -152,9 +135,9 @@ class _ByRows:
         for k in (k for k in range(len(self.trials)) if k not in self.sound):
             groups.setdefault(frozenset(_bad(self.each[k])), []).append(k)
         self.table = self._table()
-        found, queue = dict[Account, dict[int, _Best]](), list(groups.values())
+        found, queue = dict[Account, dict[int, Told]](), list(groups.values())
         while queue:
-            story, group = list[_Best](), queue.pop()
+            story, group = list[Told](), queue.pop()
             some, before = [self.trials[k] for k in group], _pooled([self.each[k] for k in group])
             while (bad := _bad(before)) and len(story) <= len(bad) + len(self.rows):
                 if (best := self._best(some, before)) is None:
@@ -169,7 +152,7 @@ class _ByRows:
                 found.setdefault(same, {}).update(dict.fromkeys(group, best))
         return [self._together(some) for some in found.values()]
 
-    def _together(self, some: Mapping[int, _Best]) -> Told:
+    def _together(self, some: Mapping[int, Told]) -> Told:
         """Return one account of several trials; an offset is their mean, or a right angle."""
         (first, best), *_ = some.items()
         account, moved = best.account, None
@@ -181,8 +164,9 @@ class _ByRows:
             j, x = account.columns[0], self.trials[first].states
             i = next(row.i for row in self.rows if j in row.by and row in self.each[first])
             moved = (i, float(np.nanmean(x[:, j])), float(np.nanmax(x[:, i]) - np.nanmin(x[:, i])))
-        whole, others = len(some) == len(self.trials), () if self.sound else best.others
-        return Told(account, tuple(sorted(some)), best.gain, others, whole, moved=moved)
+        which, whole = tuple(sorted(some)), len(some) == len(self.trials)
+        others = () if self.sound else best.others
+        return Told(account, which, best.gain, others, whole, moved=moved)
 
     def _table(self) -> list[Account]:
         """Return the accounts of these trials, of columns that rows relate as well."""
@@ -213,7 +197,7 @@ class _ByRows:
                 if self.units[j].endswith("/s") and dead[j]:
                     yield Account("dead", (j,))
 
-    def _best(self, trials: Sequence[Trial], before: Mapping[Row, Gap]) -> _Best | None:
+    def _best(self, trials: Sequence[Trial], before: Mapping[Row, Gap]) -> Told | None:
         """Return the account that best mends the rows of trials, its gain and those as good."""
         bad, n = frozenset(k for row in _bad(before) for k in row.states), self.model.n
         cost = dict[Account, float]()
@@ -253,7 +237,7 @@ class _ByRows:
             for one in rest
             if cost[one] < cost[first] + MARGIN and not one.touched > first.touched
         )
-        return _Best(first, -least, others)
+        return Told(first, (), -least, others)
 
 
 def _spread(x: Array, about: float | None = None) -> Array:
@@ -293,10 +277,10 @@ def _by_motion(
     some = _examined(trials, shown)
     every = accounts(model, shown, inputs=[trials[k].inputs for k in some])
     table = [one for one in every if Term.MOTION in one.terms]
-    examined = {k: _Seen(model, trials[k], rows, shown, table) for k in some}
+    examined = {k: _Seen(model, trials[k], rows, shown) for k in some}
     found = dict[Account, dict[int, tuple[Fit, Fit]]]()
     for k, one in examined.items():
-        for account, fits in one.better():
+        for account, fits in one.better(table):
             found.setdefault(account, {})[k] = fits
     against = {account: any(one.worse(account) for one in examined.values()) for account in found}
     # a trial in another unit may be one of many; columns are exchanged in all of a kind
@@ -328,48 +312,48 @@ def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
 
 
 class _Seen:
-    """A trial as it would be by each account of a table, and what the model misses of each.
+    """A trial as it would be by one account or another, and what the model misses of each.
 
     Args:
         model: however crude.
         trial: of its states and inputs.
         rows: the kinematic rows.
         shown: indices of the states with a sensor.
-        table: the accounts.
     """
 
     def __init__(
-        self,
-        model: Model,
-        trial: Trial,
-        rows: Sequence[Row],
-        shown: Sequence[int],
-        table: Sequence[Account],
+        self, model: Model, trial: Trial, rows: Sequence[Row], shown: Sequence[int]
     ) -> None:
         self.model, self.trial, self.known = model, trial, known_states(trial, shown)
-        self.gaps = gaps(model, trial, rows)
-        self.logged = Ahead(model, trial, self.known, STARTS, horizon=JUDGED_S)
-        unknown = {i for i in range(model.n) if i not in self.known}
-        self.gains = dict[Account, float]()
-        some = [one for one in table if not one.touched & unknown]
-        if self.logged.enough and some:
-            each = plainly_missed(self.logged, versions(trial, [Account(""), *some]))
-            self.gains = dict(zip(some, np.nan_to_num(each[0] - each[1:]).tolist(), strict=True))
+        self.gaps, self.gains = gaps(model, trial, rows), dict[Account, float]()
+        self.logged = self._without(Account(""))
 
-    def better(self) -> Iterator[tuple[Account, tuple[Fit, Fit]]]:
+    def _without(self, account: Account) -> Ahead:
+        """Return the predictions of the trial without a fault."""
+        run = account.mended(self.trial)
+        return Ahead(self.model, run, self.known, STARTS, horizon=JUDGED_S)
+
+    def gain(self, account: Account) -> float:
+        """Return by how much less the model as it is misses without a fault [nats]."""
+        if account not in self.gains:
+            known = {*self.known, *range(self.model.n, self.model.n + self.model.m)}
+            both = (self.logged, self._without(account)) if account.touched <= known else ()
+            if both and all(one.enough for one in both):
+                before, after = (one.plain(np.ones(self.model.m)).missed for one in both)
+                self.gains[account] = float(np.nan_to_num(before - after))
+        return self.gains.setdefault(account, 0.0)
+
+    def better(self, table: Iterable[Account]) -> Iterator[tuple[Account, tuple[Fit, Fit]]]:
         """Yield the accounts that the calibrated model clearly prefers, with both fits."""
-        likely = sorted(
-            (a for a, g in self.gains.items() if g > HINT), key=lambda a: -self.gains[a]
-        )
+        likely = sorted((a for a in table if self.gain(a) > HINT), key=lambda a: -self.gains[a])
         for account in [one for one in likely if self._allowed(one)][:SHORTLIST]:
-            mended = account.mended(self.trial)
-            ahead = Ahead(self.model, mended, self.known, STARTS, horizon=JUDGED_S)
-            if ahead.enough and (fits := _compared(self.model, self.logged, ahead, account)):
+            mended = self._without(account)
+            if fits := _compared(self.model, self.logged, mended, account):
                 yield account, fits
 
     def worse(self, account: Account) -> bool:
         """Return whether the trial is better as logged."""
-        return self.gains.get(account, 0.0) < -HINT and self._allowed(account)
+        return self.gain(account) < -HINT and self._allowed(account)
 
     def _allowed(self, account: Account) -> bool:
         """Return whether no kinematic row contradicts an account."""

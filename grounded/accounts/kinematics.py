@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from grounded import places
-from grounded.accounts.levels import FINE, PART, STEPS_TO_JUDGE
+from grounded.accounts.levels import FINE, HALF, STEPS_TO_JUDGE
 from grounded.frozen import Array, wrapped
 from grounded.model import Model
 from grounded.trial import Trial, stretches
@@ -126,7 +126,9 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
                 for z in (moved, said)
             )
             noise = np.concatenate([np.diff(moved[k], axis=0, n=2) for k in usable])
-            for row, gap in _over(model, some, far, told, _size(noise) / 3, steps * trial.dt):
+            for row, gap in _over(
+                model, some, far, told, _size(noise) / np.sqrt(3), steps * trial.dt
+            ):
                 if row not in found or gap.share < found[row].share:
                     found[row] = gap
             steps *= 2
@@ -143,7 +145,8 @@ def _over(
 ) -> Iterator[tuple[Row, Gap]]:
     """Yield the gap of each row over stretches of one length [s].
 
-    It is relative to the motion of all states of the same unit: a row's own may hardly move.
+    It is relative to the motion of all states of the same unit: a row's own may hardly move. What
+    white noise of its sensor explains is no gap.
     """
     units, told = list(model.states.values()), np.array(told)
     for row in rows:
@@ -152,13 +155,16 @@ def _over(
                 float((told[:, row.i] ** 2).sum()), 1e-300
             )
             told[:, row.i] *= np.clip(times, row.low, row.high)
-    moved, said, off = _size(far), _size(told), _size(far - told)
-    varying, power = np.std(far - told, axis=0), told.var(axis=0)
+    moved, said, power = _size(far), _size(told), told.var(axis=0)
+    off, varying = (
+        np.sqrt(np.maximum(square - noise**2, 0.0))
+        for square in (_size(far - told) ** 2, np.var(far - told, axis=0))
+    )
     both = (far * (told - told.mean(axis=0))).mean(axis=0)
     for row in rows:
         i, same = row.i, [one.i for one in rows if units[one.i] == units[row.i]]
         size = float(max(moved[i], said[i], np.sqrt((said[same] ** 2).mean())))
-        if size > 0 and noise[i] < PART * size:
+        if size > 0 and noise[i] < HALF * size:
             ratio = float(both[i] / max(power[i], 1e-300))
             yield row, Gap(off[i] / size, varying[i] / size, off[i] / length, ratio, power[i])
 

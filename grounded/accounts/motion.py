@@ -268,30 +268,6 @@ class Ahead:
         return Fit(rms, gains, self.moved)
 
 
-def plainly_missed(ahead: Ahead, versions: Array) -> Array:
-    """Return what the model as it is misses of K versions of a trial [nats], (K,), at most 0.
-
-    Args:
-        ahead: the predictions of the trial as it was logged; the versions start at its samples.
-        versions: states and inputs of each, (K, T + 1, n + m).
-    """
-    model, n, shown, K = ahead.model, ahead.model.n, ahead.shown, len(versions)
-    x = starts_from(model, versions[..., :n], shown)
-    first, last = x[:, ahead.at], x[:, ahead.at + ahead.steps]
-    stepped = stepper(model, np.tile(model.values, (K * len(ahead.at), 1)), ahead.dt)
-    now = first.reshape(-1, n)
-    for j in range(ahead.steps):
-        now = stepped(now, versions[:, ahead.at + j, n:].reshape(len(now), -1))
-        now = np.fmax(np.fmin(now, STATES_BOUND), -STATES_BOUND)
-    off = model.difference(now.reshape(first.shape), last)[..., shown]
-    moved = model.difference(last, first)[..., shown].std(axis=1)
-    size = np.sqrt(off.var(axis=1))  # a constant rate is removed
-    least = EXACT * x[..., shown].std(axis=1, where=np.isfinite(x[..., shown])) + TINY
-    size = np.maximum(np.where(np.isfinite(size), size, STATES_BOUND), least)
-    share = np.clip(size / np.maximum(moved, TINY), SMALL, 1.0)
-    return np.asarray(np.log(share).sum(axis=-1))
-
-
 def basis(told: Array) -> Array:
     """Return an orthonormal basis (N, k) of a constant and the columns `told` (N, m)."""
     told = told - told.mean(axis=0) if len(told) else told

@@ -99,33 +99,22 @@ class Account:
         """Return the trial as it would be without the fault."""
         if self.kind == "pace":
             return replace(trial, dt=trial.dt * self.factor)
-        n, steps = len(trial.state_names), len(trial.inputs)
-        z, some = versions(trial, [self])[0], list(self.columns)
+        n, steps, some = len(trial.state_names), trial.steps, list(self.columns)
+        last = trial.inputs[-1:] if steps else np.full((1, len(trial.input_names)), np.nan)
+        z = np.hstack([trial.states, np.vstack([trial.inputs, last])])
+        for pair in self.pairs:
+            z[:, pair] = z[:, pair[::-1]]
         if self.kind == "axes":  # speeds (the last two columns) are rotated by the first
-            (psi, u, v), turned = self.columns, np.array(z)
-            c, s = np.cos(trial.states[:, psi]), np.sin(trial.states[:, psi])
-            turned[:, u], turned[:, v] = c * z[:, u] + s * z[:, v], c * z[:, v] - s * z[:, u]
-            z = turned
-        held = trial.start_inputs
-        sent = [k - n for k in some if k >= n]
+            psi, u, v = some
+            back = (z[:, u] + 1j * z[:, v]) * np.exp(-1j * z[:, psi])
+            z[:, u], z[:, v] = back.real, back.imag
+        z[:, some] = np.nan if self.kind == "dead" else z[:, some] / self.factor
+        z[:, some[:1]] += self.offset  # of the heading, which comes first
+        held, sent = trial.start_inputs, [k - n for k in some if k >= n]
         if held is not None and sent:
             held = np.array(held)
             held[sent] /= self.factor
         return replace(trial, states=z[:, :n], inputs=z[:steps, n:], start_inputs=held)
-
-
-def versions(trial: Trial, accounts: Sequence[Account]) -> Array:
-    """Return a trial as it would be by each account but for turned axes, (K, T + 1, n + m)."""
-    last = trial.inputs[-1:] if trial.steps else np.full((1, len(trial.input_names)), np.nan)
-    logged = np.hstack([trial.states, np.vstack([trial.inputs, last])])
-    found = np.repeat(logged[None], len(accounts), axis=0)
-    for z, account in zip(found, accounts, strict=True):
-        for pair in account.pairs:
-            z[:, pair] = z[:, pair[::-1]]
-        some = list(account.columns)
-        z[:, some] = np.nan if account.kind == "dead" else z[:, some] / account.factor
-        z[:, some[:1]] += account.offset  # of the heading, which comes first
-    return found
 
 
 @dataclass(frozen=True)
