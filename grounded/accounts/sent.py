@@ -17,7 +17,7 @@ from typing import Protocol
 
 import numpy as np
 
-from grounded.accounts.levels import FINE, PART, STEPS_TO_JUDGE
+from grounded.accounts.levels import FINE, HALF, STEPS_TO_JUDGE
 from grounded.frozen import Array, median, white_noise
 from grounded.policy import Policy, z_difference
 from grounded.task import Task
@@ -99,7 +99,7 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     off = (sent - np.clip(sent, within.min(axis=0), within.max(axis=0))) ** 2
     unrelated = asked.var(axis=0) + sent.var(axis=0) + (asked - sent).mean(axis=0) ** 2
     noise = (with_noise - free[0]) ** 2  # at samples, where it is largest
-    room = np.maximum(PART * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
+    room = np.maximum(HALF**2 * unrelated, (0.02 * size) ** 2 + 4 * noise[: len(off)])
     drawn_out = np.array([max(1.0, steps_alike(column) / ROUGH) for column in (sent - asked).T])
     share = off.mean(axis=0) / room.mean(axis=0) * drawn_out
     # somebody may take over: every part must be alike
