@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.accounts.finding import SENSOR_DELAY
 from grounded.errors import NextCommand
 from grounded.findings import Finding as Said
 from grounded.findings import found as said
@@ -41,6 +40,7 @@ class Reading:
 
 NUMBERS = ("scale", "offset", "delay_s")
 UNCHANGED = Reading()
+SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
 
 
 def readings(mapping: LogMapping | None) -> dict[str, Reading]:
