@@ -254,6 +254,10 @@ class Task:
         reward = reward or self.reward
         return step_rewards(reward, error, trial.inputs, self.input_target[:T], past)
 
+    def inside_safety(self, states: Array) -> Array:
+        """Return states (..., n), each moved into its bounds of [safety] if it is outside."""
+        return np.clip(states, self.safety_low, self.safety_high)
+
     def utility(self, trial: Trial) -> float:
         """Return the utility of a real trial (section 2 of the paper): the sum of its rewards.
 

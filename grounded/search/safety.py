@@ -166,10 +166,10 @@ def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> Finding | Non
     if not np.isfinite([task.safety_low, task.safety_high]).any():
         return None
     states = coasting(plan, run, held)[:, : task.model.n]
-    excess = np.maximum(task.safety_low - states, states - task.safety_high)
-    if not (excess > 0).any():
+    excess = np.abs(states - task.inside_safety(states))
+    if not excess.any():
         return None
-    t = int(np.argmax((excess > 0).any(axis=1)))
+    t = int(np.argmax(excess.any(axis=1)))
     i = int(np.argmax(excess[t]))
     most = int(np.argmax(excess[:, i]))
     name, unit = list(task.model.states.items())[i]

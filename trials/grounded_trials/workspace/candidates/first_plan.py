@@ -146,8 +146,7 @@ def unguarded(plan: Plan) -> Iterator[Finding]:
     if plan.refused is None:
         return
     task, states = plan.task, plan.refused.predicted_states
-    assert task.safety_low is not None and task.safety_high is not None
-    out = ((states < task.safety_low) | (states > task.safety_high)).any(axis=0)
+    out = (states != task.inside_safety(states)).any(axis=0)
     weight = task.reward.state + task.reward.terminal
     given, names = np.isfinite(task.target).any(axis=0), task.model.state_names
     for which, unweighed in ((~given, 0), (given & (weight == 0), 1)):

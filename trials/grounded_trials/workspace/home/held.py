@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -139,10 +139,6 @@ class Held:
             unit = self._unit(kind, index, field)
             found.append(Number(kind, index, name, field, was + by, was, std, unit))
         return tuple(found)
-
-    def without(self, lost: Sequence[Number]) -> tuple[Number, ...]:
-        """Return the numbers but some."""
-        return tuple(one for one in self.numbers if one not in lost)
 
     # -- where an effect acts
 

@@ -98,9 +98,8 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
     urdf = XmlText(source.read_bytes(), str(source)).root.tag == "robot"
     for _ in range(2):  # again without what the written file does not compile to
         form = Urdf(source) if urdf else Mjcf(source, held.file)
-        numbers = held.without(dropped)
-        dropped += form.write(numbers)
-        numbers = held.without(dropped)
+        dropped += form.write([one for one in held.numbers if one not in dropped])
+        numbers = [one for one in held.numbers if one not in dropped]
         taken = {n.name: Value(n.value, n.std, n.unit, n.was) for n in numbers}
         texts = {n.name: Estimate(n.value, n.std, unit=n.unit).text for n in dropped}
         told = [*lost, *(finding("model.no_place", n, value=text) for n, text in texts.items())]

@@ -243,10 +243,8 @@ class Run:
 
     def _unsafe(self, states: Array) -> NDArray[np.bool_]:
         """Return which of some states (N, n) are outside [safety], (N,)."""
-        task = self.workspace.task
-        assert task.safety_low is not None and task.safety_high is not None
-        out: NDArray[np.bool_] = (states < task.safety_low) | (states > task.safety_high)
-        return np.asarray(out.any(axis=1))
+        inside = self.workspace.task.inside_safety(states)
+        return np.asarray((states != inside).any(axis=1))
 
     def ended_early(self, silent: Sequence[str]) -> Finding | None:
         """Return that it ended early; None if it did not.

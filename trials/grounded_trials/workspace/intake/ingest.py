@@ -299,23 +299,20 @@ def _first_bad(trial: Trial) -> tuple[str, int]:
 
 def _unsafe(task: Task, trial: Trial, ran: Candidate) -> Iterator[Finding]:
     """Yield the states that left [safety], with the predicted value."""
-    assert task.safety_low is not None and task.safety_high is not None
     states = trial.states[: trial.finite_steps + 1]
-    for i, (name, unit) in enumerate(task.model.states.items() if len(states) else ()):
-        values = states[:, i]
-        excess = np.maximum(task.safety_low[i] - values, values - task.safety_high[i])
-        t = int(np.argmax(excess))
-        if excess[t] > 0:
-            yield found(
-                "run.safety",
-                name,
-                bound=Quantity(
-                    float(np.clip(values[t], task.safety_low[i], task.safety_high[i])), unit
-                ),
-                at=Quantity(float(np.argmax(excess > 0)) * trial.dt, "s"),
-                most=Quantity(float(values[t]), unit),
-                predicted=Quantity(float(ran.predicted_states[t, i]), unit),
-            )
+    inside = task.inside_safety(states)
+    excess = np.abs(states - inside)
+    for i in np.flatnonzero(excess.any(axis=0)):
+        name, unit = list(task.model.states.items())[i]
+        t, first = int(np.argmax(excess[:, i])), float(np.argmax(excess[:, i] > 0))
+        yield found(
+            "run.safety",
+            name,
+            bound=Quantity(float(inside[t, i]), unit),
+            at=Quantity(first * trial.dt, "s"),
+            most=Quantity(float(states[t, i]), unit),
+            predicted=Quantity(float(ran.predicted_states[t, i]), unit),
+        )
 
 
 def _still(trial: Trial) -> Iterator[Finding]:

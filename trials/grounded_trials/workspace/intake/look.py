@@ -134,11 +134,11 @@ def fall_in(
     ceased = None if ran is None else _ceased(task, trial, ran)
     if ceased is None or ceased < STEPS_TO_JUDGE:
         return None
-    assert task.safety_low is not None and task.safety_high is not None
     whole = interpolate_gaps(trial).trial
     states = whole.states[: whole.finite_steps + 1]
-    beyond = np.maximum(task.safety_low - states, states - task.safety_high)
-    out = beyond.max(axis=1) > 0
+    safe = task.inside_safety(states)
+    beyond = np.abs(states - safe)
+    out = np.asarray(beyond.any(axis=1))
     begin = max(0, ceased - STEPS_TO_JUDGE)
     about = np.flatnonzero(out[begin : ceased + STEPS_TO_JUDGE + 1])
     if not len(about):
@@ -155,7 +155,7 @@ def fall_in(
         "run.fell",
         state,
         ran=own.id,
-        bound=Quantity(float(np.clip(was, task.safety_low[i], task.safety_high[i])), unit),
+        bound=Quantity(float(safe[first, i]), unit),
         was=Quantity(was, unit),
         predicted=Quantity(predicted, unit),
         at=Quantity(first * task.dt, "s"),
