@@ -47,7 +47,7 @@ def open_file(path: Path, *, follow: bool = True) -> BufferedReader:
         raise
 
 
-def read_file(path: Path, limit: int, *, follow: bool = True) -> bytes:
+def read_file(path: Path, limit: int | None = None, *, follow: bool = True) -> bytes:
     """Return the bytes of a regular file; for `follow` see `open_file`.
 
     Raises:
@@ -55,12 +55,12 @@ def read_file(path: Path, limit: int, *, follow: bool = True) -> bytes:
     """
     try:
         with open_file(path, follow=follow) as stream:
-            data = stream.read(limit + 1)
+            data = stream.read(-1 if limit is None else limit + 1)
     except FileNotFoundError:
         raise refused("file.missing", path) from None
     except OSError as error:
         raise unreadable(path, error) from None
-    if len(data) > limit:
+    if limit is not None and len(data) > limit:
         raise unreadable(path, f"> {limit} bytes")
     return data
 

@@ -29,7 +29,7 @@ from pathlib import Path
 from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
 from grounded.result import Document
-from grounded_trials.plain_file import BINARY, open_file, unreadable, unwritable
+from grounded_trials.plain_file import BINARY, open_file, read_file, unreadable, unwritable
 
 DIGITS = 16  # hex digits of the hash in a file name
 _NAME = re.compile(r"^([a-z]+)(\d{4,})-([0-9a-f]{16})(\.\w+)$")
@@ -127,11 +127,7 @@ class Store:
             GroundedError: if it does not exist, can't be read, or was changed.
         """
         entry = key if isinstance(key, Stored) else self.find(key)
-        try:
-            with open_file(entry.path, follow=False) as stream:
-                data = stream.read()
-        except OSError as error:
-            raise unreadable(entry.path, error) from None
+        data = read_file(entry.path, follow=False)
         if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
             raise refused("file.changed", entry.path, what="hash")
         return data

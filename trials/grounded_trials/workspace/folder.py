@@ -25,7 +25,7 @@ from grounded.search.candidate import Candidate
 from grounded.search.planner import Planner
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
-from grounded_trials.plain_file import open_file, unreadable
+from grounded_trials.plain_file import read_file, unreadable
 from grounded_trials.store.documents import Notes
 from grounded_trials.store.store import Lost, Store, Stored, made_folder, write_atomically
 from grounded_trials.store.trial_file import read_trial
@@ -393,14 +393,9 @@ class Folder:
 
         A copy is read when it is asked for: the file may be damaged.
         """
-
-        def own() -> bytes:
-            with open_file(path, follow=False) as stream:
-                return stream.read()
-
         path = self.candidate_path(identity)
         if path.is_file():
-            yield own
+            yield partial(read_file, path, follow=False)
         for one in self.trials() if trials is None else trials:
             if one.trial.candidate == identity and one.policy is not None:
                 yield partial(bytes, one.policy)

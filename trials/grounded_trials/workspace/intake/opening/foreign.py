@@ -354,7 +354,6 @@ def read_log_file(
         ran = before.trial.candidate
     chosen = "" if data else ran or outstanding(workspace, path)
     if chosen:
-        refuse_as_another(workspace, path, log.stored, chosen)
         check_candidate(workspace, path, chosen)
     read = cut_log(log, chosen)
     return replace(read, before=before) if before and chosen == ran else read
