@@ -14,7 +14,7 @@ from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from grounded_trials.formats.mcap_records import CHUNK
+from grounded_trials.formats.mcap_records import Op
 from grounded_trials.formats.mcap_walk import MAGIC
 from grounded_trials.within import SECONDS
 from pace import slowness
@@ -52,7 +52,7 @@ def _zeros(count: int, size: int) -> bytes:
     packed = zstandard.compress(struct.pack("<BQ", 0x80, size - 9) + bytes(size - 9))
     name = b"zstd"
     head = struct.pack("<QQQII", 0, 0, size, 0, len(name)) + name + struct.pack("<Q", len(packed))
-    record = struct.pack("<BQ", CHUNK, len(head) + len(packed)) + head + packed
+    record = struct.pack("<BQ", Op.CHUNK, len(head) + len(packed)) + head + packed
     end = struct.pack("<BQI", 15, 4, 0) + struct.pack("<BQQQI", 2, 20, 0, 0, 0) + MAGIC
     header = struct.pack("<BQII", 1, 8, 0, 0)
     return MAGIC + header + record * count + end

@@ -12,6 +12,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,42 @@ from grounded.findings import Finding
 from grounded_trials.formats.bad import BadRecord
 
 MAGIC = b"\x89MCAP0\r\n"  # at the beginning and the end of a file
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK = 1, 2, 3, 4, 5, 6
-MESSAGE_INDEX, ATTACHMENT, METADATA, DATA_END = 7, 9, 12, 15
 MESSAGE_HEADER = 22  # channel u16, sequence u32, log time u64, publish time u64
-_NAMES = {HEADER: "the header", SCHEMA: "a schema", CHANNEL: "a channel", MESSAGE: "a message"}
-_NAMES |= {CHUNK: "a chunk", ATTACHMENT: "an attached file", METADATA: "a table of metadata"}
 RECORD_HEAD = struct.Struct("<BQ")  # opcode, length
 _CHUNK = struct.Struct("<16xQII")  # times; size when decompressed, its CRC, length of a name
 PIECE = 2**17  # [bytes] decompressed at once; what comes before an error is kept
 _U64 = struct.Struct("<Q")
+
+
+class Op(IntEnum):
+    """What a record is."""
+
+    HEADER = 1
+    FOOTER = 2
+    SCHEMA = 3
+    CHANNEL = 4
+    MESSAGE = 5
+    CHUNK = 6
+    MESSAGE_INDEX = 7
+    CHUNK_INDEX = 8
+    ATTACHMENT = 9
+    ATTACHMENT_INDEX = 10
+    STATISTICS = 11
+    METADATA = 12
+    METADATA_INDEX = 13
+    SUMMARY_OFFSET = 14
+    DATA_END = 15
+
+
+_NAMES: dict[int, str] = {
+    Op.HEADER: "the header",
+    Op.SCHEMA: "a schema",
+    Op.CHANNEL: "a channel",
+    Op.MESSAGE: "a message",
+    Op.CHUNK: "a chunk",
+    Op.ATTACHMENT: "an attached file",
+    Op.METADATA: "a table of metadata",
+}
 
 
 @dataclass(frozen=True)
@@ -219,11 +247,11 @@ def _attachment(f: Fields) -> Attachment:
 
 
 PARSERS: dict[int, Callable[[Fields], Record]] = {
-    HEADER: lambda f: Header(f.text(), f.text()),
-    SCHEMA: lambda f: Schema(f.uint(16), f.text(), f.text(), f.skip(f.uint(32))),
-    CHANNEL: _channel,
-    ATTACHMENT: _attachment,
-    METADATA: lambda f: Metadata(f.text(), f.table()),
+    Op.HEADER: lambda f: Header(f.text(), f.text()),
+    Op.SCHEMA: lambda f: Schema(f.uint(16), f.text(), f.text(), f.skip(f.uint(32))),
+    Op.CHANNEL: _channel,
+    Op.ATTACHMENT: _attachment,
+    Op.METADATA: lambda f: Metadata(f.text(), f.table()),
 }
 
 

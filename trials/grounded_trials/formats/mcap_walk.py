@@ -25,20 +25,15 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded_trials.formats.bad import BadRecord
 from grounded_trials.formats.mcap_records import (
-    CHANNEL,
-    CHUNK,
-    DATA_END,
-    FOOTER,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEADER,
     PARSERS,
     RECORD_HEAD,
-    SCHEMA,
     Channel,
     End,
     Fields,
     Messages,
+    Op,
     Record,
     Rows,
     Schema,
@@ -50,7 +45,7 @@ from grounded_trials.formats.mcap_records import (
 Data = bytes | mmap
 BLOCK = 4 * 2**20  # [bytes] of messages outside chunks in a batch
 
-PARSED = frozenset((*PARSERS, CHUNK, MESSAGE))
+PARSED = frozenset((*PARSERS, Op.CHUNK, Op.MESSAGE))
 _U32 = Struct("<I")
 
 
@@ -129,20 +124,20 @@ class _Walk:
         while True:
             self.need(9, "a record's head")
             opcode, length = RECORD_HEAD.unpack_from(self.data, self.pos)
-            self.messages |= opcode in (CHUNK, MESSAGE)
+            self.messages |= opcode in (Op.CHUNK, Op.MESSAGE)
             self.need(9 + length, record_name(opcode))
             if self.data_crc is None and opcode in PARSED:
-                if opcode == MESSAGE:
+                if opcode == Op.MESSAGE:
                     yield self._sound(self._run_of_messages(9 + length))
                     continue
-            elif opcode not in (DATA_END, FOOTER):  # an index, or part of the summary
+            elif opcode not in (Op.DATA_END, Op.FOOTER):  # an index, or part of the summary
                 self.pos += 9 + length
                 continue
             at, start = self.pos, self.pos + 9
             content = memoryview(self.data)[start : start + length]
-            if opcode == DATA_END and self.data_crc is None:
+            if opcode == Op.DATA_END and self.data_crc is None:
                 self._data_end(content)
-            elif opcode == FOOTER:
+            elif opcode == Op.FOOTER:
                 self._footer(content)
                 yield End(bool(self.data_crc))
                 return
@@ -179,7 +174,7 @@ class _Walk:
 
     def _data_record(self, opcode: int, content: memoryview, at: int) -> Iterator[Record]:
         try:
-            if opcode == CHUNK:
+            if opcode == Op.CHUNK:
                 for record in chunk_records(chunk_content(content, packed=self.packed)[0]):
                     yield self._sound(record)
             elif opcode in PARSERS:
@@ -294,11 +289,11 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
             if cut:
                 break
             raise BadRecord("decode", what="content")
-        if opcode in (SCHEMA, CHANNEL):
+        if opcode in (Op.SCHEMA, Op.CHANNEL):
             record = PARSERS[opcode](Fields(data[pos + 9 : pos + 9 + length]))
             assert isinstance(record, Schema | Channel)
             yield record
-        if opcode != MESSAGE:
+        if opcode != Op.MESSAGE:
             pos += 9 + length
     yield batch(data, positions)
 
@@ -310,10 +305,10 @@ def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int
         BadRecord: for a message that is shorter than its header.
     """
     positions: list[int] = []
-    append, unpack = positions.append, RECORD_HEAD.unpack_from
+    append, unpack, message = positions.append, RECORD_HEAD.unpack_from, int(Op.MESSAGE)
     while end - pos >= 9:
         opcode, length = unpack(buffer, pos)
-        if opcode != MESSAGE or length > end - pos - 9:
+        if opcode != message or length > end - pos - 9:
             break
         if length < MESSAGE_HEADER:
             raise BadRecord("decode", what="header", at=f"{length} bytes")

@@ -15,26 +15,16 @@ from typing import IO
 from zlib import crc32
 
 from grounded_trials.formats.mcap_records import (
-    ATTACHMENT,
-    CHANNEL,
-    CHUNK,
-    DATA_END,
-    FOOTER,
-    HEADER,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEADER,
-    MESSAGE_INDEX,
-    METADATA,
-    SCHEMA,
     Header,
     Messages,
+    Op,
 )
 from grounded_trials.formats.protobuf import file_descriptor_set
 
 LIBRARY = "grounded"
 CHUNK_SIZE = 1024 * 1024  # [bytes] after which a chunk ends
-CHUNK_INDEX, ATTACHMENT_INDEX, STATISTICS, METADATA_INDEX, SUMMARY_OFFSET = 8, 10, 11, 13, 14
 _MESSAGE = Struct("<BQHIQQ")  # opcode, size, channel, sequence, log and publish time
 
 
@@ -58,19 +48,19 @@ class McapWriter:
         self.counts: dict[int, int] = {}  # messages by channel
         self.times: list[int] = []  # first and last of each chunk [ns]
         self.indices: dict[int, list[bytes]] = {
-            CHUNK_INDEX: [],
-            ATTACHMENT_INDEX: [],
-            METADATA_INDEX: [],
+            Op.CHUNK_INDEX: [],
+            Op.ATTACHMENT_INDEX: [],
+            Op.METADATA_INDEX: [],
         }
         self._new_chunk()
         self._put(MAGIC)
-        self._put(_record(HEADER, _text(header.profile), _text(header.library)))
+        self._put(_record(Op.HEADER, _text(header.profile), _text(header.library)))
 
     def metadata(self, name: str, table: Mapping[str, str]) -> None:
         """Add a table of strings."""
-        record = _record(METADATA, _text(name), _map(table))
-        index = _record(METADATA_INDEX, pack("<QQ", self.at, len(record)), _text(name))
-        self.indices[METADATA_INDEX].append(index)
+        record = _record(Op.METADATA, _text(name), _map(table))
+        index = _record(Op.METADATA_INDEX, pack("<QQ", self.at, len(record)), _text(name))
+        self.indices[Op.METADATA_INDEX].append(index)
         self._put(record)
 
     def attachment(
@@ -79,9 +69,9 @@ class McapWriter:
         """Add a named file; for the times [ns] see `mcap_records.Attachment`."""
         times, called = pack("<QQ", log_time, create_time), _text(name) + _text(media_type)
         content = times + called + pack("<Q", len(data)) + data
-        record = _record(ATTACHMENT, content, pack("<I", crc32(content)))
+        record = _record(Op.ATTACHMENT, content, pack("<I", crc32(content)))
         place = pack("<QQ", self.at, len(record)) + times + pack("<Q", len(data))
-        self.indices[ATTACHMENT_INDEX].append(_record(ATTACHMENT_INDEX, place, called))
+        self.indices[Op.ATTACHMENT_INDEX].append(_record(Op.ATTACHMENT_INDEX, place, called))
         self._put(record)
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
@@ -90,7 +80,7 @@ class McapWriter:
         if key not in self.schemas:
             number, length = len(self.schemas) + 1, pack("<I", len(data))
             head = pack("<H", number) + _text(name) + _text(encoding)
-            self.schemas[key] = _record(SCHEMA, head, length, data)
+            self.schemas[key] = _record(Op.SCHEMA, head, length, data)
             self._add(self.schemas[key])
         return list(self.schemas).index(key) + 1
 
@@ -100,7 +90,7 @@ class McapWriter:
         """Open a channel whose messages have the schema of an id, 0 for none; return its id."""
         number = len(self.channels) + 1
         head = pack("<HH", number, schema)
-        record = _record(CHANNEL, head, _text(topic), _text(encoding), _map(metadata or {}))
+        record = _record(Op.CHANNEL, head, _text(topic), _text(encoding), _map(metadata or {}))
         self.channels.append(record)
         self._add(record)
         return number
@@ -128,7 +118,7 @@ class McapWriter:
         number = count if sequence is None else sequence
         published = log_time if publish_time is None else publish_time
         size = MESSAGE_HEADER + len(data)
-        self._add(_MESSAGE.pack(MESSAGE, size, channel, number, log_time, published), data)
+        self._add(_MESSAGE.pack(Op.MESSAGE, size, channel, number, log_time, published), data)
         if self.size > CHUNK_SIZE:
             self._end_chunk()
 
@@ -149,12 +139,13 @@ class McapWriter:
     def finish(self) -> None:
         """End the file; the stream stays open."""
         self._end_chunk()
-        self._put(_record(DATA_END, pack("<I", self.crc)))
+        self._put(_record(Op.DATA_END, pack("<I", self.crc)))
 
         # The summary repeats schemas and channels, and says where everything is.
-        tables = (len(self.indices[i]) for i in (ATTACHMENT_INDEX, METADATA_INDEX, CHUNK_INDEX))
+        kinds = Op.ATTACHMENT_INDEX, Op.METADATA_INDEX, Op.CHUNK_INDEX
+        tables = (len(self.indices[kind]) for kind in kinds)
         statistics = _record(
-            STATISTICS,
+            Op.STATISTICS,
             pack("<QHI", sum(self.counts.values()), len(self.schemas), len(self.channels)),
             pack("<III", *tables),
             pack("<QQ", min(self.times, default=0), max(self.times, default=0)),
@@ -162,19 +153,19 @@ class McapWriter:
             *(pack("<HQ", *one) for one in self.counts.items()),
         )
         groups = {
-            SCHEMA: [*self.schemas.values()],
-            CHANNEL: self.channels,
-            STATISTICS: [statistics],
+            Op.SCHEMA: [*self.schemas.values()],
+            Op.CHANNEL: self.channels,
+            Op.STATISTICS: [statistics],
             **self.indices,
         }
         begin, offsets = self.at, list[bytes]()
         start = begin
         for opcode, records in groups.items():
             length = sum(map(len, records))
-            offsets.append(_record(SUMMARY_OFFSET, pack("<BQQ", opcode, start, length)))
+            offsets.append(_record(Op.SUMMARY_OFFSET, pack("<BQQ", opcode, start, length)))
             start += length
         summary = b"".join([*chain(*groups.values()), *offsets])
-        summary += pack("<BQQQ", FOOTER, 20, begin, start)
+        summary += pack("<BQQQ", Op.FOOTER, 20, begin, start)
         self._put(summary + pack("<I", crc32(summary)) + MAGIC)
         self.stream.flush()
 
@@ -202,15 +193,17 @@ class McapWriter:
         self.times += times
         span, sizes, start = pack("<QQ", *times), pack("<QQ", len(packed), len(data)), self.at
         head = pack("<QI", len(data), crc32(data)) + _text(kind) + pack("<Q", len(packed))
-        self._put(_record(CHUNK, span, head, packed))
+        self._put(_record(Op.CHUNK, span, head, packed))
         ended, places = self.at, b""
         for channel, entries in self.entries.items():
             places += pack("<HQ", channel, self.at)
             index = pack(f"<HI{len(entries)}Q", channel, 8 * len(entries), *entries)
-            self._put(_record(MESSAGE_INDEX, index))
+            self._put(_record(Op.MESSAGE_INDEX, index))
         place = pack("<QQI", start, ended - start, len(places)) + places
         where = place + pack("<Q", self.at - ended)
-        self.indices[CHUNK_INDEX].append(_record(CHUNK_INDEX, span, where, _text(kind), sizes))
+        self.indices[Op.CHUNK_INDEX].append(
+            _record(Op.CHUNK_INDEX, span, where, _text(kind), sizes)
+        )
         self._new_chunk()
 
 

@@ -25,15 +25,8 @@ from grounded.findings import Finding, found
 from grounded.result import UNSAID, Document
 from grounded_trials.formats.bad import BadRecord
 from grounded_trials.formats.mcap_records import (
-    ATTACHMENT,
-    CHUNK,
-    DATA_END,
-    FOOTER,
     MAGIC,
-    MESSAGE,
     MESSAGE_HEADER,
-    MESSAGE_INDEX,
-    METADATA,
     PARSERS,
     RECORD_HEAD,
     Attachment,
@@ -42,6 +35,7 @@ from grounded_trials.formats.mcap_records import (
     Header,
     Messages,
     Metadata,
+    Op,
     Record,
     Schema,
     batch,
@@ -218,28 +212,28 @@ class Salvage:
         pos, before, dropped_chunk = len(MAGIC), 0, False  # the kind of the record before
         while (stop := self._end_of(pos)) is not None:
             opcode, end = self.data[pos], stop
-            if opcode == MESSAGE and (self._ended or before in (CHUNK, MESSAGE_INDEX)):
-                self.losses.append(found("file.lost", part=record_name(MESSAGE), byte=pos))
-            elif opcode == MESSAGE:  # a run of messages outside chunks
-                while (further := self._end_of(stop)) and self.data[stop] == MESSAGE:
+            if opcode == Op.MESSAGE and (self._ended or before in (Op.CHUNK, Op.MESSAGE_INDEX)):
+                self.losses.append(found("file.lost", part=record_name(Op.MESSAGE), byte=pos))
+            elif opcode == Op.MESSAGE:  # a run of messages outside chunks
+                while (further := self._end_of(stop)) and self.data[stop] == Op.MESSAGE:
                     stop = further
                 run = self.data[pos:stop]
                 positions = message_positions(run, 0, len(run))[0]
                 self._outside += len(positions)
                 yield from self._sound(batch(run, positions))
-            elif opcode == FOOTER:
+            elif opcode == Op.FOOTER:
                 if self.data[end : end + 9] != MAGIC:
                     self.losses.append(found("file.lost", part="its end"))
                 return
             else:
                 content, kept = self.data[pos + 9 : end], len(self.losses)
-                if opcode == DATA_END:
+                if opcode == Op.DATA_END:
                     self._data_end(content)
-                if opcode == MESSAGE_INDEX and dropped_chunk:
+                if opcode == Op.MESSAGE_INDEX and dropped_chunk:
                     self._count_lost(content)
                 yield from self._record(opcode, content, pos)
-                dropped_chunk &= opcode == MESSAGE_INDEX
-                dropped_chunk |= opcode == CHUNK and len(self.losses) > kept
+                dropped_chunk &= opcode == Op.MESSAGE_INDEX
+                dropped_chunk |= opcode == Op.CHUNK and len(self.losses) > kept
                 before = opcode
             self._crc, pos = zlib.crc32(self.data[pos:stop], self._crc), stop
         yield from self._cut(self.data[pos:])
@@ -250,19 +244,19 @@ class Salvage:
 
     def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
         try:
-            if opcode == CHUNK:
+            if opcode == Op.CHUNK:
                 data, checked = chunk_content(content)
                 for record in list(chunk_records(data)):
                     if isinstance(record, Messages) and not checked:
                         self._outside += len(record)
                     yield from self._sound(record)
             elif opcode in PARSERS:
-                self._tables += opcode in (METADATA, ATTACHMENT)
+                self._tables += opcode in (Op.METADATA, Op.ATTACHMENT)
                 yield from self._sound(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
             what = record_name(opcode)
             self.losses.append(found("file.lost", part=what, byte=pos, why=error.finding.what))
-            if opcode == CHUNK and len(content) >= 16:
+            if opcode == Op.CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
 
     def _sound(self, record: Record) -> Iterator[Record]:
@@ -304,13 +298,13 @@ class Salvage:
             return None
         opcode, length = RECORD_HEAD.unpack_from(self.data, pos)
         end = pos + 9 + int(length)
-        short = opcode == MESSAGE and length < MESSAGE_HEADER
-        return None if opcode == 0 or opcode > DATA_END or end > self.size or short else end
+        short = opcode == Op.MESSAGE and length < MESSAGE_HEADER
+        return None if opcode == 0 or opcode > Op.DATA_END or end > self.size or short else end
 
     def _cut(self, rest: bytes) -> Iterator[Record]:
         """Yield the intact parts of the record in which the file ends."""
         try:
-            if len(rest) > 49 and rest[0] == CHUNK:
+            if len(rest) > 49 and rest[0] == Op.CHUNK:
                 fields = Fields(rest[9 + 16 :])
                 size, _, compression = fields.uint(64), fields.skip(4), fields.text()
                 packed = fields.content[fields.pos + 8 :]
