@@ -1,7 +1,8 @@
 """The contents of messages as Python objects, whatever their encoding.
 
 rosbags decodes CDR (ROS 2) and ROS 1 messages, Google's library protobuf, and Python's JSON: one
-by one, about 10 us a message. The rows of a table are one object whose numbers are columns.
+by one, about 10 us a message. The rows of a table are one object whose numbers are columns, and so
+are CDR messages of one form (`cdr`), unless a path needs them one by one.
 `path_walk` finds numbers in them.
 """
 
@@ -11,13 +12,15 @@ import json
 import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from grounded_trials.formats.bad import BadMessage, BadSchema
-from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema
+from grounded_trials.formats.cdr import Uneven, columns
+from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema, windows
 from grounded_trials.formats.protobuf import message_class, spelled, unspelled
 
 Ints = NDArray[np.int64]
@@ -31,17 +34,36 @@ ABSENT = object()  # what a message has in place of a field that was not sent
 class Decoded:
     """Messages of one topic, or the rows of a table: N in all."""
 
-    objects: Sequence[Any]  # N of them; of a table one
     log_times: Ints  # (N,) [ns]
     publish_times: Ints  # (N,) [ns]
-    is_table: bool = False
+    columns: Any = None  # one object for all, each of its numbers (N,); None: they differ in form
+    decode: Callable[[int], Any] | None = None  # returns message i; None: it is a table
+
+    @cached_property
+    def objects(self) -> Sequence[Any]:
+        """The messages one by one.
+
+        Raises:
+            BadMessage: for one that is not of its type.
+        """
+        return [self.message(i) for i in range(len(self.log_times))]
+
+    def message(self, i: int) -> Any:
+        """Return message i; raises as `objects` does."""
+        assert self.decode is not None
+        try:
+            return self.decode(i)
+        except MemoryError:
+            raise
+        except Exception as error:  # each library has its own
+            raise BadMessage(i, "decode", what="message", why=_short(error)) from None
 
     @property
     def samples(self) -> Sequence[Any]:
         """The first and the last message, or a table's first row."""
-        if not self.is_table:
-            return [self.objects[0], self.objects[-1]]
-        columns = self.objects[0].items()
+        if self.decode is not None:
+            return [self.message(i) for i in (0, -1)]
+        columns = self.columns.items()
         return [{k: [0.0] * len(v) if isinstance(v, list) else 0.0 for k, v in columns}]
 
 
@@ -51,31 +73,35 @@ class Decoder:
 
     name: str  # of the message type
     decode: Callable[[bytes], Any] = field(repr=False)
+    columns: Callable[[NDArray[np.uint8]], Any] | None = field(default=None, repr=False)  # of CDR
 
     def parts(self, batch: Messages | Rows) -> Iterator[Decoded]:
-        """Yield the contents of messages, or of a table's rows, in pieces.
-
-        Raises:
-            BadMessage: for a message that is not of its type, with its index in the piece.
-        """
+        """Yield the contents of messages, or of a table's rows, in pieces."""
         if isinstance(batch, Rows):
-            yield Decoded([_nested(batch.columns)], batch.times, batch.times, is_table=True)
+            yield Decoded(batch.times, batch.times, _nested(batch.columns))
             return
         piece = np.cumsum(batch.ends - batch.starts) // PIECE
         for number in range(int(piece[-1]) + 1 if len(piece) else 0):
             first, last = np.searchsorted(piece, [number, number + 1])
-            objects = list[Any]()
-            for i in range(first, last):
-                try:
-                    objects.append(self.decode(batch.buffer[batch.starts[i] : batch.ends[i]]))
-                except MemoryError:
-                    raise
-                except Exception as error:  # each library has its own
-                    why = _short(error)
-                    raise BadMessage(len(objects), "decode", what="message", why=why) from None
-            if objects:
+            if first < last:
+                starts, ends = batch.starts[first:last], batch.ends[first:last]
                 times = batch.log_times[first:last], batch.publish_times[first:last]
-                yield Decoded(objects, *times)
+                decode = partial(self._message, batch.buffer, starts, ends)
+                yield Decoded(*times, self._together(batch.buffer, starts, ends), decode)
+
+    def _message(self, buffer: bytes, starts: Ints, ends: Ints, i: int) -> Any:
+        return self.decode(buffer[starts[i] : ends[i]])
+
+    def _together(self, buffer: bytes, starts: Ints, ends: Ints) -> Any:
+        """Return messages as one, None if they are not of one form."""
+        length = int(ends[0] - starts[0])
+        if self.columns is None or not length or (ends - starts != length).any():
+            return None
+        rows = windows(buffer, f"V{length}")[starts].view(np.uint8).reshape(len(starts), length)
+        try:
+            return self.columns(rows)
+        except Uneven:
+            return None
 
 
 def _short(error: Exception) -> str:
@@ -109,7 +135,7 @@ def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
         raise BadSchema("decode", what="schema", at=encoding)
     if encoding == "protobuf":
         return Decoder(name, message_class(schema.data, name).FromString)
-    return Decoder(name, _ros(schema, encoding))
+    return _ros(schema, encoding)
 
 
 # What the objects are
@@ -163,8 +189,8 @@ _NOT_PLAIN = re.compile(
 )
 
 
-def _ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
-    """Return what decodes the messages of a ROS definition.
+def _ros(schema: Schema, encoding: str) -> Decoder:
+    """Return the decoder of the messages of a ROS definition.
 
     Raises:
         BadSchema: if rosbags can't use it.
@@ -199,8 +225,9 @@ def _ros(schema: Schema, encoding: str) -> Callable[[bytes], Any]:
     except Exception as error:  # a parser raises whatever a damaged definition leads to
         raise BadSchema("decode", what="definition", why=_short(error)) from None
     if encoding == "ros1":
-        return lambda data: store.deserialize_ros1(data, name)
-    return lambda data: store.deserialize_cdr(data, name)
+        return Decoder(schema.name, lambda data: store.deserialize_ros1(data, name))
+    together = partial(columns, name=name, types=plain, classes=store.types)
+    return Decoder(schema.name, lambda data: store.deserialize_cdr(data, name), together)
 
 
 def _is_plain(kind: str, fields: Sequence[tuple[str, Any]]) -> bool:

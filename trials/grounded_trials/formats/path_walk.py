@@ -72,23 +72,45 @@ def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
         BadMessage: for a stamp outside the calendar.
         BadPath: if a message has no number at the end of the path, suggesting the nearest name.
     """
-    split, names = _stamped(part, path.steps) if stamps and not part.is_table else (0, ())
+    if part.columns is not None:
+        try:
+            return _in_columns(part, path, stamps)
+        except BadPath:  # several values, a text, or none
+            if part.decode is None:
+                raise
+    split, names = _stamped(part.objects, path.steps) if stamps else (0, ())
     rows, holders = _walk([*range(len(part.objects))], [*part.objects], path.steps[:split])
     at, ends = _walk([*range(len(rows))], holders, path.steps[split:])
-    if part.is_table and len(ends) > 1:
-        raise BadPath("path", expected="one value", found=str(len(ends)))
-    values = _apply(ends, path.function, part.is_table)
-    if part.is_table:
-        # A table of a run may end with a state after its last command.
-        count = len(values) - bool(len(values) > 1 and not np.isfinite(values[-1]))
-        times = part.log_times[:count] if ends else None
-        return Found(np.arange(count), values[:count], times)
+    values = _apply(ends, path.function)
     found, messages = np.array(at, dtype=np.int64), np.array(rows, dtype=np.int64)
     if not names:
         return Found(messages[found], values, None)
-    known, times = _times(messages, holders, names)
+    stamped, of = _walk([*range(len(holders))], holders, [Field(name) for name in names])
+    known, times = np.zeros(len(holders), np.bool_), np.zeros(len(holders), np.int64)
+    known[stamped], times[stamped] = True, _times(of, messages[stamped])
     good = known[found]
     return Found(messages[found[good]], values[good], times[found[good]])
+
+
+def _in_columns(part: Decoded, path: MessagePath, stamps: bool) -> Found:
+    """Evaluate a path on one object whose numbers are columns.
+
+    Raises:
+        BadPath: if it does not lead to one column.
+    """
+    whole, table = [part.columns], part.decode is None
+    split, names = _stamped(whole, path.steps) if stamps and not table else (0, ())
+    _, holders = _walk([0], whole, path.steps[:split])
+    _, ends = _walk([0] * len(holders), holders, path.steps[split:])
+    if len(ends) != 1:
+        raise BadPath("path", expected="one value", found=str(len(ends) or "nothing"))
+    values, rows = _apply(ends, path.function, columns=True), np.arange(len(part.log_times))
+    if not table:
+        _, of = _walk([0] * len(holders), holders, [Field(name) for name in names])
+        return Found(rows, values, _times(of, rows) if names else None)
+    # A table of a run may end with a state after its last command.
+    count = len(values) - bool(len(values) > 1 and not np.isfinite(values[-1]))
+    return Found(rows[:count], values[:count], part.log_times[:count])
 
 
 def _walk(rows: list[int], values: Values, steps: Sequence[Step]) -> tuple[list[int], Values]:
@@ -176,14 +198,14 @@ def _passes(values: Values, step: Filter) -> list[bool]:
 # Time stamps
 
 
-def _stamped(part: Decoded, steps: Sequence[Step]) -> tuple[int, tuple[str, ...]]:
+def _stamped(objects: Sequence[Any], steps: Sequence[Step]) -> tuple[int, tuple[str, ...]]:
     """Return after how many steps a path is in the object with the stamp, and the names to it.
 
     The first message decides that the path goes through.
     """
-    found = 0, _stamp_in(next(iter(part.objects), None))
+    found = 0, _stamp_in(next(iter(objects), None))
     ways = [Slice(0, -1) if isinstance(step, Slice) else step for step in steps]
-    for one in part.objects:
+    for one in objects:
         values: Values = [one]
         for i, step in enumerate(ways, start=1):
             values = (
@@ -216,30 +238,35 @@ def is_time(value: Any) -> bool:
     return len(names) == 2 and names[0] in SECONDS and names[1] in NANOSECONDS
 
 
-def _times(messages: Ints, holders: Values, names: Sequence[str]) -> tuple[Any, Ints]:
-    """Return which objects have a stamp, and the stamps [ns].
+def _times(stamps: Values, messages: Ints) -> Ints:
+    """Return stamps [ns], of some messages.
 
     Raises:
         BadMessage: for one outside the calendar.
     """
-    rows, stamps = _walk([*range(len(holders))], holders, [Field(name) for name in names])
-    known, times = np.zeros(len(holders), np.bool_), np.zeros(len(holders), np.int64)
-    if stamps:
-        whole, rest = (_part(stamps, part) for part in names_in(stamps[0]))
-        outside = ~((np.abs(whole) <= CALENDAR_S) & (np.abs(rest) < 2**32))
-        if outside.any():
-            k = int(np.argmax(outside))
-            at = f"{whole[k]:g} s {rest[k]:g} ns"
-            raise BadMessage(messages[rows[k]], "decode", what="stamp", at=at)
-        known[rows], times[rows] = True, whole.astype(np.int64) * 10**9 + rest.astype(np.int64)
-    return known, times
+    if not stamps:
+        return np.zeros(0, np.int64)
+    whole, rest = (_part(stamps, part).ravel() for part in names_in(stamps[0]))
+    outside = ~((np.abs(whole) <= CALENDAR_S) & (np.abs(rest) < 2**32))
+    if outside.any():
+        k = int(np.argmax(outside))
+        at = f"{whole[k]:g} s {rest[k]:g} ns"
+        raise BadMessage(messages[k], "decode", what="stamp", at=at)
+    times: Ints = whole.astype(np.int64) * 10**9 + rest.astype(np.int64)
+    return times
 
 
 # The number at the end
 
 
-def _apply(values: Values, function: str, is_table: bool) -> Floats:
-    """Return the numbers at the end of a path, of its function if it has one."""
+def _apply(values: Values, function: str, *, columns: bool = False) -> Floats:
+    """Return the numbers at the end of a path, of its function if it has one.
+
+    Args:
+        values: objects, or the only one, whose numbers are columns.
+        function: one of `FUNCTIONS`, or "".
+        columns: whether they are columns.
+    """
     kind = function.rpartition(".")[2]
     if kind in ANGLES:
         return _angle(kind, _turn(values))
@@ -247,15 +274,15 @@ def _apply(values: Values, function: str, is_table: bool) -> Floats:
         return _in_world(values, AXES.index(kind))
     if kind == "norm":
         return np.array([_norm(value) for value in values], dtype=np.float64).reshape(-1)
-    return _numbers(values, is_table)
+    if not columns:
+        return _numbers(values)
+    if not isinstance(values[0], np.ndarray) or values[0].ndim != 1:
+        raise BadPath("path", expected="number", found="list")
+    return values[0].astype(np.float64)
 
 
-def _numbers(values: Values, is_table: bool) -> Floats:
+def _numbers(values: Values) -> Floats:
     """Return numbers as an array, NaN for None (null in JSON, which has no NaN)."""
-    if is_table and values and isinstance(values[0], np.ndarray):
-        return values[0].astype(np.float64)
-    if is_table:
-        raise BadPath("path", expected="number", found="list" if values else "nothing")
     bad = next((v for v in values if not (v is None or _is_number(v))), None)
     if bad is not None:
         known = tuple(names_in(bad)) or (("[0]", "[:]") if is_list(bad) else ())
@@ -282,7 +309,7 @@ def _part(values: Values, *names: str) -> Floats:
 def _column(values: Values) -> Floats:
     """Return numbers of objects, (N,), or of a table, (1, N)."""
     of_table = any(isinstance(one, np.ndarray) for one in values)
-    return np.array(values, dtype=np.float64) if of_table else _numbers(values, is_table=False)
+    return np.array(values, dtype=np.float64) if of_table else _numbers(values)
 
 
 def _turn(values: Values, *names: str) -> list[Floats]:
@@ -319,7 +346,7 @@ def _in_world(values: Values, axis: int) -> Floats:
         both = f"{'.'.join(TURNED)} and {'.'.join(MOVING)}"
         raise BadPath("path", at=f"@{WORLD}", expected=both, found=_kind(values[0]))
     x, y, z, w = _turn(values, *TURNED)
-    v = [_part(values, *MOVING, name) for name in AXES]
+    v = [_part(values, *MOVING, name).ravel() for name in AXES]
     row = (
         (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
         (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
