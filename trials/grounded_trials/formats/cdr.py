@@ -22,6 +22,10 @@ KINDS |= {f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)}
 TEXT = object()  # in place of texts, which may differ
 
 
+class Column(np.ndarray[Any, np.dtype[Any]]):
+    """A number of N messages, (N,), or a list of k of them, (k, N); no list of one message."""
+
+
 class Uneven(Exception):
     """Messages are not of one form, or hold what is not known here."""
 
@@ -77,7 +81,7 @@ class _Block:
             return self.numbers(inner[1][0], count) if count else []
         return [self.value(inner) for _ in range(count)]
 
-    def numbers(self, kind: str, count: int) -> NDArray[Any]:
+    def numbers(self, kind: str, count: int) -> Column:
         """Read `count` numbers (count, N)."""
         if kind not in KINDS:
             raise Uneven
@@ -87,7 +91,7 @@ class _Block:
         if self.at > self.rows.shape[1]:
             raise Uneven
         found = np.ascontiguousarray(self.rows[:, start : self.at]).view(dtype).T
-        return found != 0 if kind == "bool" else found
+        return (found != 0 if kind == "bool" else found).view(Column)
 
     def count(self) -> int:
         """Read a length, which must be that of all."""

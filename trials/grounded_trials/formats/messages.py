@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded_trials.formats.bad import BadMessage, BadSchema
-from grounded_trials.formats.cdr import Uneven, columns
+from grounded_trials.formats.cdr import Column, Uneven, columns
 from grounded_trials.formats.mcap_records import Channel, Messages, Rows, Schema, windows
 from grounded_trials.formats.protobuf import message_class, spelled, unspelled
 
@@ -114,9 +114,9 @@ def _nested(columns: dict[str, Floats]) -> dict[str, Any]:
     for name, column in columns.items():
         bare, bracket, _ = name.partition("[")
         if bracket and bare not in columns:
-            table.setdefault(bare, []).append(column)
+            table.setdefault(bare, []).append(column.view(Column))
         else:
-            table[name] = column
+            table[name] = column.view(Column)
     return table
 
 
@@ -169,6 +169,8 @@ def fields_of(values: Sequence[Any], name: str) -> list[Any]:
 
 def is_list(value: Any) -> bool:
     """Check whether a value has items."""
+    if isinstance(value, Column):
+        return value.ndim > 1
     return hasattr(value, "__len__") and not isinstance(value, str | bytes | dict)
 
 

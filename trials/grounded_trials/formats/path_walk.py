@@ -278,7 +278,7 @@ def _apply(values: Values, function: str, *, columns: bool = False) -> Floats:
         return _numbers(values)
     if not isinstance(values[0], np.ndarray) or values[0].ndim != 1:
         raise BadPath("path", expected="number", found="list")
-    return values[0].astype(np.float64)
+    return np.array(values[0], dtype=np.float64)
 
 
 def _numbers(values: Values) -> Floats:
