@@ -15,6 +15,7 @@ from grounded.accounts.judge import judge
 from grounded.accounts.sound_trials import sound_trials
 from grounded.accounts.table import DEGREES, Account
 from shared_data import needs_data
+from stepped import logged, stepped
 
 ROBOT = {name: make() for name, make in ROBOTS.items()}
 
@@ -34,8 +35,7 @@ def logs():
     ("robot", "fault"),
     [
         *(
-            (name, fault)
-            for name in ("boat",)
+            ("boat", fault)
             for fault in (
                 "degrees once",
                 "positions: feet",
@@ -50,8 +50,7 @@ def logs():
         ("car", "lengths: mm"),
         ("boat", "compass, gyro"),
         *(
-            (name, fault)
-            for name in ("drone",)
+            ("drone", fault)
             for fault in (
                 "angles: degrees",
                 "rate: rpm",
@@ -108,13 +107,9 @@ def gyro(rng, *, dead=True, steps=600, dt=0.1):
         derivative=lambda s, a, p: {"psi": s.r, "r": (a.omega - s.r) / p.tau},
     )
     t = dt * np.arange(steps)
-    sent = (0.35 * np.sin(0.3 * t) + 0.2 * np.sin(1.1 * t))[:, None]
-    x = [np.zeros(2)]
-    for u in sent:
-        x.append(model.system.step(x[-1][None], u[None], model.values, dt)[0])
-    y = np.array(x) + [0.002, 0.024] * rng.normal(size=(steps + 1, 2))
-    y[:, 1] -= dead * np.array(x)[:, 1]
-    return model, Trial(y, sent, dt, model.state_names, model.input_names)
+    sent = 0.35 * np.sin(0.3 * t) + 0.2 * np.sin(1.1 * t)
+    x = stepped(model, sent, dt) * [1.0, not dead]
+    return model, logged(model, x, sent, dt, [0.002, 0.024], rng)
 
 
 def test_dead_comes_before_exchanged():

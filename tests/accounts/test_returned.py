@@ -14,7 +14,7 @@ from grounded.onboard import Runner
 from grounded.plant import Plant
 from grounded.search.ask_tell import Search
 from grounded.trial import Trial
-from small_tasks import drive, other, rover_task
+from small_tasks import drive, other, plain_task, rover_task
 
 
 def columns(task, candidate, trial):
@@ -30,16 +30,9 @@ MODEL = gr.Model(
     derivative=lambda s, a, p: {"x": s.v, "v": a.force / p.mass},
 )
 T = np.linspace(0.0, 1.0, 51)
-TASK = gr.Task(
-    model=MODEL,
-    dt=0.02,
-    target=np.column_stack([T**3 * (10 - 15 * T + 6 * T**2), np.full(51, np.nan)]),
-    reward=gr.Reward(state=[10.0, 0.0], terminal=[50.0, 0.0], input=[0.001], input_change=[0.01]),
-    start=np.zeros(2),
-    past=np.zeros(1),
-    low=np.array([-15.0]),
-    high=np.array([15.0]),
-)
+WAY = np.column_stack([T**3 * (10 - 15 * T + 6 * T**2), np.full(51, np.nan)])
+WEIGHTS = {"terminal": [50.0, 0.0], "effort": 0.001, "change": 0.01}
+TASK = plain_task(MODEL, 0.02, WAY, [10.0, 0.0], 15.0, **WEIGHTS)
 
 
 def robot(candidate, units=1.0, noise=0.0, late=0):
@@ -222,17 +215,8 @@ def test_a_velocity_in_another_unit_is_corrected_by_a_factor_and_no_key():
         derivative=lambda s, a, p: {"x": s.v, "v": a.force - s.v},
     )
     target = np.column_stack([np.linspace(0, 1, 41), np.full(41, np.nan)])
-    task = gr.Task(
-        model=model,
-        dt=0.05,
-        target=target,
-        reward=gr.Reward(state=[1.0, 0], terminal=[1.0, 0], input=[0.01], input_change=[0.01]),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=np.array([-5.0]),
-        high=np.array([5.0]),
-        feedback=False,
-    )
+    weights = {"terminal": [1.0, 0.0], "effort": 0.01, "change": 0.01}
+    task = plain_task(model, 0.05, target, [1.0, 0.0], 5.0, **weights, feedback=False)
     search = gr.Search(task)
     trial = drive(task, Plant(model), search.ask())
     with pytest.warns(UserWarning, match=holding("v", "mm")) as told:

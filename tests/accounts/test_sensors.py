@@ -18,6 +18,7 @@ from grounded.effects.sensor import sensor_lag
 from grounded.errors import GroundedError
 from grounded.findings import Quantity, found
 from grounded.frozen import Array
+from stepped import levels, logged, stepped
 
 
 def craft(lag=0.3, drag=0.4, gain=1.0):
@@ -42,17 +43,11 @@ def craft(lag=0.3, drag=0.4, gain=1.0):
 
 def clocked(model, *, early=0, seed=0, dt=0.02, steps=900, hold=15):
     """Under commands that change every 0.3 s; `early`: steps by which the states are ahead."""
-    rng, x, states = np.random.default_rng(seed), np.zeros(model.n), []
-    sent = np.repeat(rng.uniform(-1, 1, (steps // hold, model.m)), hold, axis=0)
-    for u in sent:
-        states.append(x)
-        x = model.system.step(x[None], u[None], model.values, dt)[0]
-    logged = np.array([*states, x])
-    logged += 0.002 * np.std(logged, axis=0) * rng.normal(size=logged.shape)
-    a, b = max(early, 0), max(-early, 0)
-    used = steps - a - b
-    states, sent = logged[a : a + used + 1], sent[b : b + used]
-    return Trial(states, sent, dt, model.state_names, model.input_names, id=f"t{seed:04}")
+    rng = np.random.default_rng(seed)
+    sent = levels(rng, steps // hold, hold, m=model.m)
+    x = stepped(model, sent, dt)
+    noise = 0.002 * np.std(x, axis=0)
+    return logged(model, x[early:], sent[: steps - early], dt, noise, rng, id=f"t{seed:04}")
 
 
 REAL = craft(lag=0.15, drag=0.7, gain=0.8)
@@ -94,13 +89,9 @@ def swung(kind, noise=2e-4, steps=700, keep=0.5):
     """A swing; w is filtered from q's differences, or an own sensor: 2 steps late, or slow."""
     rng, fine = np.random.default_rng(3), 20
     t = DT / fine * np.arange((steps + 1) * fine)
-    rates, q, w = [], [], []
-    for a, b, c in ((0.35, 3.4, 0.0), (0.1, 1.3, 1.0), (0.05, 6.0, 2.0)):
-        q.append(a * np.sin(b * t + c))
-        w.append(a * b * np.cos(b * t + c))
-        rates.append(-a * b * b * np.sin(b * t + c))
-    q, w = sum(q), sum(w)
-    u = (sum(rates) + 12.0 * q)[::fine]
+    waves = ((0.35, 3.4, 0.0), (0.1, 1.3, 1.0), (0.05, 6.0, 2.0))
+    q, w = sum(a * np.exp(1j * (b * t + c)) * [[-1j], [b]] for a, b, c in waves).real
+    u = sum((12.0 - b * b) * a * np.sin(b * t + c) for a, b, c in waves)[::fine]
     seen = q[::fine] + noise * rng.standard_normal(steps + 1)
     if kind == "filtered":
         logged, last = np.zeros(steps + 1), 0.0

@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from grounded import Model, Param, Trial
+from grounded import Model, Param
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.telling import instrument_lines
-from grounded.effects import Library
 from grounded.models.arm import model as arm
+from stepped import levels, library, logged, stepped
 
 DT = 0.02
 
@@ -29,51 +29,40 @@ def motor(a):
     )
 
 
-def run(model, seed=0, steps=200):
-    rng, fine = np.random.default_rng(seed), replace(model, substeps=8)
-    u = np.repeat(rng.uniform(-1, 1, steps // 10), 10)[:, None]
-    states = [np.zeros(2)]
-    for one in u:
-        states.append(fine.system.step(states[-1][None], one[None], fine.values, DT)[0])
-    noise = rng.standard_normal((steps + 1, 2)) * [1e-3, 1e-2]
-    return Trial(np.array(states) + noise, u, DT, model.state_names, model.input_names)
+def run(model, seed):
+    rng = np.random.default_rng(seed)
+    u = levels(rng, 20, 10)
+    x = stepped(replace(model, substeps=8), u, DT)
+    return logged(model, x, u, DT, [1e-3, 1e-2], rng)
 
 
 def test_the_verdict_tells_it():
     model = motor(95.0)
-    options = DiagnosisOptions(library=Library((Library().family("input_gain"),)))
+    options = DiagnosisOptions(library=library("input_gain"))
     found = diagnose(model, [run(model, k) for k in range(3)], options)
     assert "substeps=2" in found.preflight[0].advice
     assert [one.kind for one in found.preflight] == ["time step"]
 
 
-STEP, LATE, WHIRL = 0.02, 2, 10.0  # [s], steps, [N m]
-
-
-def driven(k, whirl=0.0, steps=80, size=0.4):
+def driven(k, whirl=0.0, steps=80):
     """A run whose inputs are 40 ms late; `whirl` [N m] turns the second joint from 0.6 s on."""
-    rng, t = np.random.default_rng(k), STEP * np.arange(steps)
-    u = size * np.stack([3 * np.sin((3 + k) * t + k), np.sin((5 - k) * t)], axis=1)
+    rng, t = np.random.default_rng(k), DT * np.arange(steps)
+    u = 0.4 * np.stack([3 * np.sin((3 + k) * t + k), np.sin((5 - k) * t)], axis=1)
     u[30:, 1] += whirl
-    states = [np.array([-np.pi / 2, 0.0, 0.0, 0.0])]
-    for one in [np.zeros(2)] * LATE + list(u[: steps - LATE]):
-        z = states[-1]
-        for _ in range(40):
-            z = arm.system.step(z[None], one[None], arm.values, STEP / 40)[0]
-        states.append(z)
-    y = np.array(states) + rng.standard_normal((steps + 1, 4)) * [1e-3, 1e-3, 1e-2, 1e-2]
-    return Trial(y, u, STEP, arm.state_names, arm.input_names, id=f"t{k:04d}")
+    late = np.r_[np.zeros((2, 2)), u[:-2]]
+    parts, start = np.repeat(late, 40, axis=0), [-np.pi / 2, 0.0, 0.0, 0.0]
+    x = stepped(arm, parts, DT / 40, start)[::40]
+    return logged(arm, x, u, DT, [1e-3, 1e-3, 1e-2, 1e-2], rng, id=f"t{k:04d}")
 
 
 def test_a_whirling_trial_is_cut_where_the_model_cannot_be_integrated():
-    trials = [driven(0, WHIRL), driven(1), driven(2)]
+    trials = [driven(0, 10.0), driven(1), driven(2)]
     looked = preflight(arm, trials)
     (found,) = [one for one in looked.findings if one.kind == "unresolved"]
     keep = looked.trials[0].known_steps
-    assert (
-        found.signal == "q2_vel" and found.corrected and found.share == pytest.approx(1 - keep / 80)
-    )
+    assert found.signal == "q2_vel" and found.corrected
+    assert found.share == pytest.approx(1 - keep / 80)
     assert 35 < keep < 60 and [t.known_steps for t in looked.trials[1:]] == [80, 80]
-    assert (found.said.facts["trial"], found.said.facts["at"].value) == ("t0000", keep * STEP)
+    assert (found.said.facts["trial"], found.said.facts["at"].value) == ("t0000", keep * DT)
     (line,) = [x for x in instrument_lines(looked.findings) if "time steps" in x]
     assert line.startswith("q2_vel: reaches 331 rad/s") and "corrected" not in line

@@ -16,9 +16,8 @@ from grounded.model import Model, Param
 from grounded.models import aircraft, car, pendulum
 from grounded.search.first_guess import first_guess
 from grounded.solve import ddp
-from grounded.task import Task
-from grounded.utility import Reward
 from problems import SPECS, system
+from small_tasks import plain_task
 from stepped import slopes
 
 UNARY = {
@@ -282,9 +281,8 @@ def test_rates_that_depend_on_little(which, integrator):
     np.testing.assert_allclose(f_x[0][2:, 2:], np.eye(10))
     assert f_u[0, 1, 0] == pytest.approx(0.1 if which == "input alone" else 0.0)
     assert system.how == "compiled"
-    weights = Reward(np.ones(12), np.zeros(12), np.ones(1), np.ones(1))
-    bounds = {"low": np.array([-1.0]), "high": np.array([1.0])}
-    task = Task(model, 0.1, np.zeros((21, 12)), weights, np.ones(12), np.zeros(1), **bounds)
+    weights = {"effort": 1.0, "change": 1.0, "start": np.ones(12)}
+    task = plain_task(model, 0.1, np.zeros((21, 12)), 1.0, 1.0, **weights)
     result = ddp.solve(task.problem(), np.zeros((20, 1)))
     assert np.isfinite(result.cost) and np.isfinite(result.K).all()
 

@@ -12,7 +12,7 @@ from grounded.engine import Engine, each, running
 from grounded.fit import fit
 from grounded.model import Model, Param
 from grounded.progress import Interrupted, Stages, within
-from grounded.trial import Trial
+from stepped import logged, stepped
 
 
 def lag(s, a, p):
@@ -35,12 +35,8 @@ def trials():
     truth = MODEL.with_values({"gain": 2.4, "dead": 0.35})
     for low in (0.0, 0.6, 0.6, 0.6):  # only the first drives slowly: there the threshold acts
         u = np.repeat(rng.uniform(low, 1.0, (12, 1)), 10, axis=0)
-        x = np.zeros((len(u) + 1, 1))
-        for t, command in enumerate(u):
-            x[t + 1] = truth.system.step(x[t : t + 1], command[None], truth.values, 0.05)[0]
-            x[t + 1] += 0.005 * rng.standard_normal()
-        y = x + 0.01 * rng.standard_normal(x.shape)
-        found.append(Trial(dt=0.05, states=y, inputs=u, state_names=("v",), input_names=("u",)))
+        x = stepped(truth, u, 0.05, disturbed=np.array([0.005]), rng=rng)
+        found.append(logged(truth, x, u, 0.05, 0.01, rng))
     return found
 
 

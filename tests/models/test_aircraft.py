@@ -11,6 +11,7 @@ from grounded.experiments.figure8 import DT, figure8_target, flight_task, pertur
 from grounded.models.aircraft import PARAMS, dynamics, lift_coefficient, model
 from grounded.models.aircraft_trim import level_trim
 from grounded.models.pendulum import model as pendulum
+from stepped import stepped
 
 VALUES = SimpleNamespace(**{name: param.value for name, param in PARAMS.items()})
 
@@ -22,10 +23,7 @@ def rates(x, u, values=VALUES):
 
 
 def fly(x, u, seconds):
-    path = [x]
-    for _ in range(round(seconds / DT)):
-        path.append(model.system.step(path[-1][None], u[None], model.values, DT)[0])
-    return np.array(path)
+    return stepped(model, np.tile(u, (round(seconds / DT), 1)), DT, x)
 
 
 def column(path, name):
@@ -123,10 +121,8 @@ def test_without_air_energy_and_spin_are_kept():
         v, w = x[0, 3:6], x[0, 9:12]
         return 0.5 * v @ v + 9.81 * x[0, 2] + 0.5 * w @ inertia @ w
 
-    before = energy(x)
-    for _ in range(100):
-        x = still.system.step(x, np.zeros((1, 4)), still.values, DT)
-    assert energy(x) == pytest.approx(before, rel=1e-7)
+    after = stepped(still, np.zeros((100, 4)), DT, x[0])[-1:]
+    assert energy(after) == pytest.approx(energy(x), rel=1e-7)
 
 
 def test_lift_falls_beyond_the_stall():

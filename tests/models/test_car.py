@@ -11,6 +11,7 @@ import grounded
 from grounded.experiments.car_tasks import DT, NAMES, RAMP_DOWN, RAMP_UP, car_task, target
 from grounded.experiments.real_car import CALIBRATION, UNMODELLED, real_car
 from grounded.models.car import dynamics, model
+from stepped import stepped
 
 P = SimpleNamespace(**{k: p.value for k, p in model.params.items()})
 
@@ -21,12 +22,9 @@ def rates(u1=0.0, u2=0.0, **state):
 
 
 def simulate(steering, throttle, seconds, of=model, **state):
-    x = np.array([[state.get(name, 0.0) for name in of.state_names]])
-    path = [x[0]]
-    for _ in range(round(seconds / DT)):
-        x = of.system.step(x, np.array([[steering, throttle]]), of.values, DT)
-        path.append(x[0])
-    return dict(zip(of.state_names, np.array(path).T, strict=True))
+    start = [state.get(name, 0.0) for name in of.state_names]
+    path = stepped(of, np.tile([steering, throttle], (round(seconds / DT), 1)), DT, start)
+    return dict(zip(of.state_names, path.T, strict=True))
 
 
 def test_equations_of_section_5_2_by_hand():

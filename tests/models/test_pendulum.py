@@ -6,15 +6,11 @@ import pytest
 from grounded.experiments.pendulum import FRICTION, HEAVIER, pendulum_task
 from grounded.experiments.pendulum import model as real
 from grounded.models.pendulum import model
+from stepped import stepped
 
 
 def swing(of, theta, seconds, torque=0.0, dt=0.002):
-    x = np.array([[theta, 0.0]])
-    path = [x[0]]
-    for _ in range(round(seconds / dt)):
-        x = of.system.step(x, np.array([[torque]]), of.values, dt)
-        path.append(x[0])
-    return np.array(path)
+    return stepped(of, np.full(round(seconds / dt), torque), dt, [theta, 0.0])
 
 
 def test_small_swings_have_the_textbooks_period():

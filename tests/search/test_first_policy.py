@@ -45,16 +45,9 @@ def test_the_guess_is_finite_and_ddp_is_near_from_it(name):
 def no_plan(**function):
     """Return the error for a model that is not finite at the start."""
     nothing = {"states": {"x": "m", "v": "m/s"}, "inputs": {"a": "m/s^2"}}
-    task = gr.Task(
-        model=gr.Model(**nothing, **function),
-        dt=0.1,
-        target=np.array([[0.0, np.nan]] + 10 * [[1.0, np.nan]]),
-        reward=gr.Reward(state=[1.0, 0.0], terminal=[1.0, 0.0], input=[0.1], input_change=[0.0]),
-        start=np.zeros(2),
-        past=np.zeros(1),
-        low=-np.ones(1),
-        high=np.ones(1),
-    )
+    target, weights = [[0.0, np.nan]] + 10 * [[1.0, np.nan]], [1.0, 0.0]
+    model = gr.Model(**nothing, **function)
+    task = plain_task(model, 0.1, target, weights, 1.0, terminal=weights, effort=0.1)
     with pytest.raises(gr.GroundedError, match="there is no plan to run") as raised:
         gr.Search(task).ask()
     return str(raised.value)

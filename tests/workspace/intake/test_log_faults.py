@@ -16,6 +16,7 @@ from grounded_trials.store.trial_file import read_trial, write_trial
 from grounded_trials.workspace.intake.log_faults import column_faults
 from recorded import LOGGED, record
 from ros_bags import rover_bag
+from stepped import logged, stepped
 from workspaces import CONFIG, MODEL, make
 
 
@@ -45,12 +46,9 @@ def test_a_command_in_degrees_is_named_with_its_own_table():
         derivative=lambda s, a, p: {"psi": s.r, "r": (0.6 * a.rudder - s.r) / 0.8},
         angles=("psi",),
     )
-    rudder = 0.3 * np.sign(np.sin(0.9 * np.arange(400) * 0.1))[:, None]
-    x = [np.zeros(2)]
-    for u in rudder:
-        x.append(boat.system.step(x[-1][None], u[None], boat.values, 0.1)[0])
-    y = np.array(x) + 1e-3 * np.random.default_rng(1).standard_normal((401, 2))
-    trial = Trial(y, np.degrees(rudder), 0.1, ("psi", "r"), ("rudder",))
+    rudder = 0.3 * np.sign(np.sin(0.9 * np.arange(400) * 0.1))
+    rng, x = np.random.default_rng(1), stepped(boat, rudder, 0.1)
+    trial = logged(boat, x, np.degrees(rudder), 0.1, 1e-3, rng)
     (fault,) = column_faults(SimpleNamespace(base_model=boat), trial)
     assert (fault.code, fault.about) == ("log.unit", ("rudder",))
     assert fault.facts["by"] == pytest.approx(1 / 57.29578)

@@ -24,6 +24,7 @@ from grounded_trials.workspace.intake.opening.run_start import acted_on, recordi
 from grounded_trials.workspace.intake.recognise import stories_of_log
 from recorded import follow
 from small_tasks import plain_task
+from stepped import stepped
 from workspaces import CONFIG, make
 
 FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false') + (
@@ -102,9 +103,7 @@ def test_manual_driving_is_refused(ladder, share=0.01):
     for swings in (0.5, 2.0):
         for phase in (0.0, 3.0):
             u = 3 * np.sin(np.linspace(0, 2 * np.pi * swings, 40) + phase)[:, None]
-            x = [w.task.start]
-            for k in range(40):
-                x.append(model.system.step(x[-1][None], u[k : k + 1], model.values, dt)[0])
+            x = stepped(model, u, dt, w.task.start)
             noise = np.random.default_rng(0).normal(size=(41, 2)) * share
             driven = replace(noisy(made, 0.0, 0, other=False), states=x + noise, inputs=u)
             assert refused(w, driven, made, by_alpha).about == ("force",), (swings, phase)
