@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import gaussian_filter1d
 
 import grounded as gr
 from benchmarks.accounts import ROBOTS, driven
@@ -12,13 +13,15 @@ from grounded import Model, Param, Trial
 from grounded.accounts.commands import clocks_apart, how_inputs_act, judge_clocks
 from grounded.accounts.finding import Finding, UnusableTrials, late_as_positions, late_effects
 from grounded.accounts.sound_trials import sound_trials as preflight
+from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
 from grounded.diagnosis.telling import instrument_lines
 from grounded.effects import Scales, Site, wrap
 from grounded.effects.sensor import sensor_lag
 from grounded.errors import GroundedError
 from grounded.findings import Quantity, found
 from grounded.frozen import Array
-from stepped import levels, logged, stepped
+from grounded.models.arm import model as arm
+from stepped import levels, library, logged, stepped
 
 
 def craft(lag=0.3, drag=0.4, gain=1.0):
@@ -305,3 +308,111 @@ def test_the_sign_of_an_input_is_known_though_friction_is_not_modelled(wired, se
     """With the wrong sign the feedback runs away: the input is at its limit but for 0.3 s."""
     (acts,) = how_inputs_act(AXIS, moved_by_hand(wired, seed=seed), range(2))
     assert acts.sign * wired >= 0
+
+
+POSE_DT, FINE = 0.05, 10  # [s] control step; steps of the simulation in one
+LATE, PULL, SLIP = 0.024, 0.03, 0.08  # [s] of the pose; [rad/m]; [s^2/m]
+POSE = ("x", "y", "psi")
+ROVER = Model(
+    name="rover",
+    states={"v": "m/s", "omega": "rad/s", "x": "m", "y": "m", "psi": "rad"},
+    inputs={"speed": "m/s", "turn": "rad/s"},
+    params={"tau_v": Param(0.15, "s"), "tau_w": Param(0.12, "s")},
+    angles=("psi",),
+    roles={"position": ("x", "y"), "heading": "psi", "speed": "v", "heading_rate": "omega"},
+    derivative=lambda s, a, p: {
+        "v": (a.speed - s.v) / p.tau_v,
+        "omega": (a.turn - s.omega) / p.tau_w,
+        "x": s.v * np.cos(s.psi),
+        "y": s.v * np.sin(s.psi),
+        "psi": s.omega,
+    },
+)
+
+
+def posed(seed: int, steps: int = 240) -> Trial:
+    """Drive by hand for 12 s: unequal wheels, side slip, a pose that is stamped late."""
+    rng = np.random.default_rng(seed)
+    speed, turn = gaussian_filter1d(rng.normal(size=(2, steps)), 12.0)
+    u = np.stack([0.45 + 1.6 * speed, 3.5 * turn], axis=1)
+
+    def rates(s, a):
+        v, w, _, _, psi = s
+        rate = w + PULL * v
+        aside, c, sn = -SLIP * v**2 * rate, np.cos(psi), np.sin(psi)
+        moved = [v * c - aside * sn, v * sn + aside * c, rate]
+        return np.array([(a[0] - v) / 0.15, (a[1] - w) / 0.12, *moved])
+
+    rows = stepped(rates, np.repeat(u, FINE, axis=0), POSE_DT / FINE, np.zeros(5), fine=1)
+    t, at = POSE_DT * np.arange(steps + 1), POSE_DT / FINE * np.arange(steps * FINE + 1)
+    told = [np.interp(t - LATE * (i > 1), at, row) for i, row in enumerate(rows.T)]
+    noise = [0.002, 0.004, 0.0004, 0.0004, 0.0008]
+    return logged(ROVER, np.transpose(told)[1:], u[1:], POSE_DT, noise, rng, id=f"t{seed}")
+
+
+def told(findings):
+    return {f.signal: f.delay_s for f in findings if f.kind == "delay" and f.corrected}
+
+
+def test_one_message_is_late_as_a_whole():
+    trials = [posed(seed) for seed in (1, 2, 3)]
+    assert set(told(preflight(ROVER, trials).findings)) == {"psi"}
+    found = preflight(ROVER, trials, one_message=POSE)
+    assert told(found.findings) == pytest.approx(dict.fromkeys(POSE, LATE), abs=0.004)
+    assert {f"sensor_delay:{name}" for name in POSE} <= found.settled
+
+
+STEP = 0.02
+
+
+def motor(a):
+    """A motor that reaches its speed at the rate a [1/s]."""
+    return Model(
+        name="motor",
+        states={"q": "rad", "w": "rad/s"},
+        inputs={"volts": "V"},
+        params={"a": Param(a, "1/s", 0.5 * a, 2 * a), "g": Param(9.0, "1/s^2")},
+        derivative=lambda s, u, p: {
+            "q": s.w,
+            "w": p.a * (5 * u.volts - s.w) - p.g * np.sin(s.q),
+        },
+    )
+
+
+def run(model, seed):
+    rng = np.random.default_rng(seed)
+    u = levels(rng, 20, 10)
+    x = stepped(replace(model, substeps=8), u, STEP)
+    return logged(model, x, u, STEP, [1e-3, 1e-2], rng)
+
+
+def test_the_verdict_tells_it():
+    model = motor(95.0)
+    options = DiagnosisOptions(library=library("input_gain"))
+    found = diagnose(model, [run(model, k) for k in range(3)], options)
+    assert "substeps=2" in found.preflight[0].advice
+    assert [one.kind for one in found.preflight] == ["time step"]
+
+
+def whirled(k, whirl=0.0, steps=80):
+    """A run whose inputs are 40 ms late; `whirl` [N m] turns the second joint from 0.6 s on."""
+    rng, t = np.random.default_rng(k), STEP * np.arange(steps)
+    u = 0.4 * np.stack([3 * np.sin((3 + k) * t + k), np.sin((5 - k) * t)], axis=1)
+    u[30:, 1] += whirl
+    late = np.r_[np.zeros((2, 2)), u[:-2]]
+    parts, start = np.repeat(late, 40, axis=0), [-np.pi / 2, 0.0, 0.0, 0.0]
+    x = stepped(arm, parts, STEP / 40, start)[::40]
+    return logged(arm, x, u, STEP, [1e-3, 1e-3, 1e-2, 1e-2], rng, id=f"t{k:04d}")
+
+
+def test_a_whirling_trial_is_cut_where_the_model_cannot_be_integrated():
+    trials = [whirled(0, 10.0), whirled(1), whirled(2)]
+    looked = preflight(arm, trials)
+    (found,) = [one for one in looked.findings if one.kind == "unresolved"]
+    keep = looked.trials[0].known_steps
+    assert found.signal == "q2_vel" and found.corrected
+    assert found.share == pytest.approx(1 - keep / 80)
+    assert 35 < keep < 60 and [t.known_steps for t in looked.trials[1:]] == [80, 80]
+    assert (found.said.facts["trial"], found.said.facts["at"].value) == ("t0000", keep * STEP)
+    (line,) = [x for x in instrument_lines(looked.findings) if "time steps" in x]
+    assert line.startswith("q2_vel: reaches 331 rad/s") and "corrected" not in line

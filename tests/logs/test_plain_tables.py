@@ -1,4 +1,4 @@
-"""Tables without names or times: `--columns` and `--rate`, given once and kept in [log]."""
+"""Tables without names or times, in other units, or with times in ms: told, and kept in [log]."""
 
 from __future__ import annotations
 
@@ -9,12 +9,16 @@ import numpy as np
 import pytest
 
 from cli import grounded
-from facts import holding
+from facts import holding, holds, of_code
 from grounded.errors import GroundedError
+from grounded.units import factor_between
 from grounded_trials import Workspace
 from grounded_trials.formats.tables import Layout
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.signals import SignalSpec, read_signals
+from grounded_trials.logs.stated_units import unit_in_name, without_unit
+from grounded_trials.starting.begin import begin
+from grounded_trials.starting.interval import changes_every
 
 N, RATE = 300, 50.0
 LAYOUT = Layout(("w", "u_cmd"), RATE)
@@ -112,3 +116,261 @@ def test_columns_are_assigned_by_their_names_in_every_table(tmp_path: Path, kind
     log = tomllib.loads((tmp_path / "robot" / "grounded.toml").read_text())["log"]
     assert log["state"]["psi"]["path"].endswith("heading_est")
     assert log["input"]["steering"]["path"].endswith("steering_cmd")
+
+
+MODEL = """from grounded import Model, Param
+model = Model(states={"x": "m", "v": "m/s", "theta": "rad"}, inputs={"volt": "V"},
+    params={"k": Param(1.0, "1/s", 0.5, 2.0)},
+    derivative=lambda s, a, p: {"x": s.v, "v": a.volt - p.k * s.v, "theta": a.volt - s.theta})
+"""
+
+
+@pytest.mark.parametrize(
+    ("said", "wanted", "factor"),
+    [
+        ("mm", "m", 1e-3),
+        ("mm/s^2", "m/s^2", 1e-3),
+        ("deg/s", "rad/s", np.pi / 180),
+        ("rpm", "rad/s", np.pi / 30),
+        ("km/h", "m/s", 1 / 3.6),
+        ("mN m", "N m", 1e-3),
+        ("N·m", "N m", 1.0),
+        ("%", "1", 0.01),
+        ("m", "rad", None),
+        ("furlong", "m", None),
+        ("km^400", "m", None),  # no power overflows
+        ("m^99999999999999999999", "m", None),
+    ],
+)
+def test_the_factor_between_two_units(said, wanted, factor):
+    assert factor_between(said, wanted) == (factor and pytest.approx(factor))
+
+
+def signals_of(tmp_path, model: str) -> dict:
+    """The signals that `init` finds for a model in log.csv."""
+    (tmp_path / "m.py").write_text(model)
+    log, file = tmp_path / "log.csv", tmp_path / "m.py"
+    made = grounded("init", tmp_path / "w", "--from", log, "--model", file, "--yes", "--json")
+    assert made.code == 0, made.err
+    return {one["name"]: one for one in made.json["signals"]}
+
+
+def test_units_in_a_table_s_first_row_become_scales(tmp_path):
+    t = np.arange(0, 4, 0.02)
+    v = np.sin(t)
+    x, theta = np.cumsum(v) * 0.02, 0.3 * np.cos(t)
+    rows = np.column_stack([t, 1e3 * x, 1e3 * v, np.rad2deg(theta), np.cos(t) + v])
+    head = "t,x [mm],v [mm/s],theta (deg),volt [V]"
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
+    w = tmp_path / "w"
+    signals_of(tmp_path, MODEL)
+    whole = (w / "grounded.toml").read_text()
+    (w / "grounded.toml").write_text(whole.replace("scale = 0.001\n", "", 1))
+    bare = grounded("-C", w, "ingest", "--data", tmp_path / "log.csv", "--json")
+    assert holds(bare.json["trials"][0]["warnings"][0], "x", "mm", "0.001")
+    grounded("-C", w, "discard", "t0001")
+    (w / "grounded.toml").write_text(whole)
+    done = grounded("-C", w, "ingest", "--data", tmp_path / "log.csv", "--json")
+    assert not done.json["trials"][0]["warnings"]
+    assert done.code == 0, done.err
+    high = {signal["name"]: signal["high"] for signal in done.json["trials"][0]["signals"]}
+    assert high["x"] == pytest.approx(x.max(), rel=0.01)
+    assert high["v"] == pytest.approx(1.0, rel=0.01)
+    assert high["theta"] == pytest.approx(0.3, rel=0.01)
+    assert high["volt"] == pytest.approx(np.sqrt(2), rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("path", "unit", "bare"),
+    [
+        ("/csv.r_mm", "mm", "/csv.r"),
+        ("/csv.thd_deg_s", "deg/s", "/csv.thd"),
+        ("/csv.v_m_s", "m/s", "/csv.v"),
+        ("/imu.yaw_deg", "deg", "/imu.yaw"),
+        ("/arm.q_deg[2]", "deg", "/arm.q"),
+        ("/speed_mps.data", "m/s", "/speed"),
+        ("/csv.vel_N", "N", "/csv.vel_N"),
+        ("/csv._mm", "", "/csv._mm"),
+        ("/csv.summ", "", "/csv.summ"),
+        ("/mcu.steering_pct", "%", "/mcu.steering"),
+        ("/mcu.steering_percent", "%", "/mcu.steering"),
+        ("/imu.orientation.@rpy.yaw", "", "/imu.orientation.@rpy.yaw"),
+    ],
+)
+def test_the_end_of_a_name_says_a_unit(path, unit, bare):
+    assert unit_in_name(path) == unit
+    assert without_unit(path) == bare
+
+
+BEAM = """from grounded import Model, Param
+model = Model(states={"r": "m", "rd": "m/s", "th": "rad", "thd": "rad/s"}, inputs={"volt": "V"},
+    params={"k": Param(1.0, "1/s", 0.5, 2.0)},
+    derivative=lambda s, a, p: {"r": s.rd, "rd": -7 * s.th, "th": s.thd, "thd": a.volt - s.thd})
+"""
+
+
+MM, DEG = 1e-3, np.pi / 180
+
+
+def begun(tmp_path, head: str, factors: dict[str, float]) -> dict:
+    """The signals that `init` finds in a log of the beam, each divided by its factor."""
+    t = np.arange(0, 8, 0.02)
+    th, thd = 0.1 * np.sin(2 * t), 0.2 * np.cos(2 * t)
+    rd, r = 0.35 * (np.cos(2 * t) - 1), 0.35 * (np.sin(2 * t) / 2 - t)
+    signals = {"r": r, "rd": rd, "th": th, "thd": thd, "volt": thd - 0.4 * np.sin(2 * t)}
+    rows = np.column_stack([t, *(x / factors.get(name, 1) for name, x in signals.items())])
+    np.savetxt(tmp_path / "log.csv", rows, "%.6f", ",", header=head, comments="")
+    return signals_of(tmp_path, BEAM)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        "t,r_mm,rd,th_deg,thd_deg,volt",
+        "t,r [mm],rd [m/s],th [deg],thd,volt",
+    ],
+)
+def test_names_and_heads_make_scales_and_a_rate_is_compared_after_them(tmp_path, head):
+    factors = {"r": MM, "th": DEG, "thd": DEG}
+    found = begun(tmp_path, head, factors)
+    assert {n: one["scale"] for n, one in found.items()} == {
+        n: pytest.approx(factors.get(n, 1.0)) for n in found
+    }
+    assert all(one["sure"] for one in found.values())
+
+
+TURNED = """import numpy as np
+
+from grounded import Model, Param
+
+model = Model(
+    states={"yaw": "rad", "v": "m/s"},
+    inputs={"speed": "m/s", "steering": "rad"},
+    params={"L": Param(0.35, "m", 0.1, 1.0), "tau": Param(0.3, "s", 0.05, 1.0)},
+    derivative=lambda s, a, p: {
+        "yaw": s.v * np.tan(a.steering) / p.L,
+        "v": (a.speed - s.v) / p.tau,
+    },
+    angles=("yaw",),
+)
+"""
+
+
+def test_a_heading_in_wrapped_degrees_is_told_when_it_comes_in(tmp_path):
+    rng, dt, t = np.random.default_rng(0), 0.05, 0.05 * np.arange(600)
+    speed = 0.5 + 0.5 * np.repeat(rng.uniform(0, 1, 30), 20)
+    steering, rows, yaw, v = 0.3 * np.sin(0.4 * t) + 0.24, [], 0.0, 0.0
+    for k in range(600):
+        wrapped = (np.degrees(yaw) + rng.normal(0, 0.6) + 180) % 360 - 180
+        rows.append([t[k], wrapped, v + rng.normal(0, 0.01), speed[k], steering[k]])
+        yaw += dt * v * np.tan(steering[k]) / 0.3
+        v += dt * (speed[k] - v) / 0.25
+    head = "t,yaw,v,speed_cmd,steering_cmd"
+    np.savetxt(tmp_path / "run.csv", rows, "%.6g", ",", header=head, comments="")
+    (tmp_path / "m.py").write_text(TURNED)
+    w = Workspace.create(tmp_path / "w", log=tmp_path / "run.csv", model=tmp_path / "m.py")
+    (told,) = of_code(w.ingest(tmp_path / "run.csv", data=True), "log.unit")
+    assert told.about == ("yaw",)
+
+
+TIMED = """from grounded import Model, Param
+
+model = Model(
+    states={"x": "m", "v": "m/s"},
+    inputs={"force": "N"},
+    params={"drag": Param(0.5, "1/s", 0.0, 5.0)},
+    derivative=lambda s, a, p: {"x": s.v, "v": a.force - p.drag * s.v},
+)
+"""
+
+
+def gaps(every, rows, seed=0, jitter=0.0, drift=0.0, held=0.3, odd=0):
+    """Times between changes of a command that a loop sends, as rows of a log show them."""
+    rng = np.random.default_rng(seed)
+    t = every * (1 + drift) * np.arange(600) + rng.normal(0, jitter, 600) + 0.37 * rows
+    t = t[rng.random(600) > held]  # at times it stays as it was
+    t = np.concatenate([t, rng.uniform(0, t[-1], odd)])
+    return np.diff(np.unique(np.ceil(t / rows)) * rows)
+
+
+@pytest.mark.parametrize(
+    "every, rows, more",
+    [
+        (0.05, 0.01, {}),
+        (0.05, 0.01, {"jitter": 0.002}),
+        (0.05, 0.001, {"jitter": 0.001}),
+        (0.05, 0.01, {"drift": 1e-3}),  # clocks of two computers
+        (0.05, 0.01, {"odd": 4}),
+        (0.05, 0.01, {"held": 0.6}),
+        (0.02, 0.005, {}),
+        (0.1, 0.01, {}),
+        (0.1, 0.02, {"jitter": 0.003}),
+        (0.02, 0.01, {}),
+        (0.02, 0.01, {"held": 0.0}),  # not 0.025 s, of which it is within a row
+        (0.02, 0.005, {"held": 0.0}),
+        (0.0333333, 0.005, {"jitter": 0.001}),
+        (0.0166667, 0.002, {}),
+        (0.008, 0.002, {}),  # not 0.00833333 s, of which it is within a row
+        (0.00833333, 0.002, {}),
+        (0.01, 0.005, {"jitter": 0.0007, "held": 0.0}),  # a quarter of the gaps is 5 ms, or 15
+        (0.01, 0.005, {"jitter": 0.0007, "held": 0.0, "drift": 3e-4}),
+    ],
+)
+def test_the_interval_is_found_in_what_rows_show(every, rows, more):
+    assert changes_every(gaps(every, rows, **more), rows) == every
+
+
+def table(path, every):
+    """A run of 20 s, a row every 10 ms, whose command changes every so many rows."""
+    rng, t = np.random.default_rng(1), np.arange(2000) * 0.01
+    force = np.repeat(np.round(rng.normal(0, 1, 2000 // every), 3), every)
+    v = np.cumsum(force) * 0.01
+    columns = np.column_stack([t, np.cumsum(v) * 0.01, v, force])
+    np.savetxt(path, columns, "%.5f", ",", header="t,x,v,force", comments="")
+    return path
+
+
+@pytest.mark.parametrize("every, dt", [(5, 0.05), (1, 0.01)])
+def test_a_table_of_rows_more_frequent_than_commands_has_the_commands_interval(tmp_path, every, dt):
+    (tmp_path / "m.py").write_text(TIMED)
+    found = begin(tmp_path / "w", table(tmp_path / "r.csv", every), model=tmp_path / "m.py")
+    assert found.dt == dt
+    assert 'seen_in = "r.csv"' in (tmp_path / "w/grounded.toml").read_text()
+    assert bool(of_code(found, "start.interval")) == (every == 5)
+
+
+def in_ms(path, column="t", seconds=1e-3):
+    """20 s of a cart at 100 Hz, whose first row is at 0; times in units of `seconds`."""
+    t = np.arange(2000) * 0.01
+    u = np.where((t % 2) < 1, 1.0, -1.0)
+    rows = np.column_stack([t / seconds, np.cumsum(u) * 0.01, u])
+    np.savetxt(path, rows, "%.6g", ",", header=f"{column},v,force", comments="")
+    return path
+
+
+def test_times_in_ms_are_asked_about_and_next_is_to_begin_again(tmp_path):
+    log = in_ms(tmp_path / "a.csv")
+    made = begin(tmp_path / "w", log, kind="generic", inputs=["force"])
+    assert made.then.verb == "init" and made.then.arguments[0] == str(tmp_path / "w-2")
+    assert not of_code(made, "file.odd_values")  # the row at 0 is no fault
+    done = grounded("init", tmp_path / "v", "--from", log, "--inputs", "force", "--yes")
+    told = " ".join(done.out.replace("\\\n", " ").split())
+    assert f"init {tmp_path / 'v-2'} --from {log} --inputs force" in told.partition("next: ")[2]
+    renamed = in_ms(tmp_path / "b.csv", column="t_ms")
+    again = begin(tmp_path / "w-2", renamed, kind="generic", inputs=["force"])
+    assert again.dt < 2 and again.then.verb == "ingest"
+
+
+def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path):
+    in_ms(tmp_path / "a.csv", "time_s")
+    rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)
+    rows[:, 0] += 1.764e12
+    np.savetxt(tmp_path / "b.csv", rows, "%.1f", ",", header="time_s,v,force", comments="")
+    assert begin(tmp_path / "w", tmp_path / "b.csv", kind="generic", inputs=["force"]).dt < 2
+
+
+def test_a_model_that_no_input_moves_is_fitted_before_it_is_diagnosed(tmp_path):
+    log = in_ms(tmp_path / "b.csv", column="t_ms")
+    begin(tmp_path / "w", log, kind="generic", inputs=["force"])
+    done = grounded("-C", tmp_path / "w", "ingest", "--data", log)
+    assert "fit --apply" in done.out.partition("next: ")[2]

@@ -1,4 +1,4 @@
-"""Run `grounded` commands and kill them at random moments, in a separate process for test_kill."""
+"""Run `grounded` commands and kill them at random moments, in a separate process for test_store."""
 
 import os
 import random

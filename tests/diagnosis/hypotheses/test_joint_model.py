@@ -10,7 +10,7 @@ from grounded.diagnosis.likelihood.data import prepare
 from grounded.effects import Library
 from grounded.models.pendulum import model as pendulum
 from grounded.trial import Trial
-from tests.effects.test_effects_joint import PAIRS, arm, real_trials
+from tests.effects.test_effects_medium import PAIRS, arm, real_trials
 
 
 @pytest.fixture(autouse=True)
