@@ -89,8 +89,8 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
         shown: indices of the states with a sensor.
         account: the fault, of another trial.
     """
-    with np.errstate(all="ignore"):
-        return _Seen(model, trial, (), shown).gain(account) < -HINT
+    with np.errstate(all="ignore"):  # a command at its limit may make a constant rate
+        return _Seen(model, trial, (), shown, constant=False).gain(account) < -HINT
 
 
 # --- by rows --------------------------------------------------------------------------------------
@@ -319,19 +319,27 @@ class _Seen:
         trial: of its states and inputs.
         rows: the kinematic rows.
         shown: indices of the states with a sensor.
+        constant: remove a constant rate of each state.
     """
 
     def __init__(
-        self, model: Model, trial: Trial, rows: Sequence[Row], shown: Sequence[int]
+        self,
+        model: Model,
+        trial: Trial,
+        rows: Sequence[Row],
+        shown: Sequence[int],
+        *,
+        constant: bool = True,
     ) -> None:
-        self.model, self.trial, self.known = model, trial, known_states(trial, shown)
+        self.model, self.trial, self.constant = model, trial, constant
+        self.known = known_states(trial, shown)
         self.gaps, self.gains = gaps(model, trial, rows), dict[Account, float]()
         self.logged = self._without(Account(""))
 
     def _without(self, account: Account) -> Ahead:
         """Return the predictions of the trial without a fault."""
         run = account.mended(self.trial)
-        return Ahead(self.model, run, self.known, STARTS, horizon=JUDGED_S)
+        return Ahead(self.model, run, self.known, STARTS, constant=self.constant, horizon=JUDGED_S)
 
     def gain(self, account: Account) -> float:
         """Return by how much less the model as it is misses without a fault [nats]."""
