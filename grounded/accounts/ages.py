@@ -50,7 +50,7 @@ from grounded.trial import Trial
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
 OFF = 0.03  # scale error that is reported, beyond both of its bounds
 OWN = 200  # logged samples from which the model's own lag is computed
-PASTS, LATER = (24, 12, 6, 3), 2  # differences before and after the sample that get a weight
+PAST, LATER = 24, 2  # differences before and after the sample that get a weight
 SHORTEST = 4  # steps in a stretch for a bias
 SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
 
@@ -306,27 +306,18 @@ def derived(
     Returns:
         None if it has another scale, is not explained by the position's past, or averages less.
     """
-    dt, logs = trials[0].dt, list(_rates(model, relation, trials))
+    dt, logs, length = trials[0].dt, list(_rates(model, relation, trials)), PAST + LATER
     ways = [np.concatenate([[0.0], np.cumsum(moved)])[:, None] for _, moved, _ in logs]
     # an encoder is at rest on one count mostly
     floor = quantum([piece[:, 0] for piece, *_ in logs]) / np.sqrt(12)
     noise = float(np.max([floor, np.median([white_noise(way) for way in ways])]))
-    tried = (_weighed(logs, dt, least, past, noise) for past in PASTS)
-    return next((found for found in tried if found is not None), None)
-
-
-def _weighed(
-    logs: Sequence[tuple[Array, Array, Array]], dt: float, least: float, past: int, noise: float
-) -> Derived | None:
-    """Return the same from the weights of `past` differences; `noise` is the position's."""
-    length = past + LATER
     long = [(moved / dt, w) for _, moved, w in logs if len(moved) >= length]
     rows = [np.lib.stride_tricks.sliding_window_view(rate, length)[:, ::-1] for rate, _ in long]
     count = sum(map(len, rows))
     if count < 2 * length:
         return None
     a = np.concatenate(rows)
-    w = np.concatenate([w[past : past + len(r)] for (_, w), r in zip(long, rows, strict=True)])
+    w = np.concatenate([w[PAST : PAST + len(r)] for (_, w), r in zip(long, rows, strict=True)])
     weights, _, rank, _ = np.linalg.lstsq(a, w, rcond=None)
     rest = w - a @ weights
     left = float(np.sqrt(rest @ rest / count))

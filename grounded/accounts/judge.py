@@ -43,12 +43,12 @@ class Verdict:
     Args:
         told: accounts in the order in which they were found.
         corrected: the trials as they would be without what is certain.
-        open: the rows that no account explains.
+        open: the rows that no account explains, with their gaps over all trials.
     """
 
     told: tuple[Told, ...]
     corrected: tuple[Trial, ...]
-    open: tuple[Row, ...]
+    open: Mapping[Row, Gap]
 
 
 def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdict:
@@ -72,7 +72,7 @@ def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdic
     corrected = list(trials)
     for one in (one for one in told if one.certain):
         corrected = _without(one, corrected)
-    return Verdict(tuple(told), tuple(corrected), tuple(_bad(left)))
+    return Verdict(tuple(told), tuple(corrected), {row: left[row] for row in _bad(left)})
 
 
 def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:

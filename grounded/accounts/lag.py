@@ -113,14 +113,10 @@ class _Pieces:
         return _centred([at_samples(b, np.arange(len(a)) + self.reach + by) for a, b in pairs])
 
     def scatter(self, force: Array) -> float:
-        """Return the standard deviation of the sum of `force` (N,) from the scatter of its parts.
-
-        Parts are stretches of time, or of one place in every piece: the larger one counts.
-        """
-        lengths = [len(a) for a in self.a]
-        total = np.arange(sum(lengths)) * max(FEWEST_SAMPLES, 2 * len(lengths)) // sum(lengths)
-        place = np.concatenate([np.arange(n) * FEWEST_SAMPLES // (2 * n) for n in lengths])
-        return max(float(np.linalg.norm(np.bincount(group, force))) for group in (total, place))
+        """Return the standard deviation of the sum of `force` (N,) by the scatter of its parts."""
+        parts = max(FEWEST_SAMPLES, 2 * len(self.a))
+        part = np.arange(len(force)) * parts // len(force)
+        return float(np.linalg.norm(np.bincount(part, force)))
 
     @property
     def windows(self) -> int:

@@ -1,15 +1,15 @@
-"""Checks of one signal on its own: samples that repeat, drop out, stick or jump by a turn."""
+"""The samples of one sensor on its own: they repeat, drop out, stick or jump by a turn."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from grounded.accounts.finding import Finding
-from grounded.accounts.levels import FEWEST_SAMPLES, NEARLY_ALL, STEPS_TO_JUDGE
+from grounded.accounts.levels import FACTOR, FEWEST_SAMPLES, NEARLY_ALL, STEPS_TO_JUDGE
 from grounded.findings import found
 from grounded.frozen import Array
 from grounded.model import Model
@@ -17,87 +17,58 @@ from grounded.trial import Trial
 
 FULL_TURNS = (2 * np.pi, 360.0)
 
+Columns = Sequence[Array]  # the samples of a state in each trial, (T + 1,), NaN where missing
+Gone = tuple[Sequence[Any], Mapping[str, Any]]  # samples that show nothing, and what is told of it
 
-@dataclass(frozen=True, eq=False)
-class Signal:
-    """One state of all trials.
+
+def judge_samples(
+    model: Model, trials: Sequence[Trial], shown: Sequence[int]
+) -> tuple[list[Finding], list[Trial]]:
+    """Check the samples of each sensor on its own; return the findings and the mended trials.
 
     Args:
-        name: of the state.
-        unit: of the state.
-        angle: whether its differences wrap.
-        columns: its samples in each trial (T + 1,), NaN where missing.
-        dt: time step [s].
+        model: with the units.
+        trials: of its states, of one time step.
+        shown: indices of the states with a sensor.
     """
-
-    name: str
-    unit: str
-    angle: bool
-    columns: Sequence[Array]
-    dt: float
-
-    @property
-    def changes(self) -> Array:
-        """The sizes of all changes from sample to sample, without zeros."""
-        d = np.concatenate([np.abs(np.diff(x)) for x in self.columns])
-        return np.asarray(d[np.isfinite(d) & (d > 0)])
-
-    def told(
-        self, kind: str, part: float = np.nan, /, *, mended: bool = False, **facts: Any
-    ) -> Finding:
-        """Return a finding on its samples."""
-        said = found("sensor.samples", self.name, **facts)
-        return Finding(self.name, said, kind, share=part, corrected=mended)
-
-    def without(self, gone: Sequence[Any]) -> Signal:
-        """Return the signal with some samples missing."""
-        pairs = zip(self.columns, gone, strict=True)
-        return replace(self, columns=[np.where(g, np.nan, x) for x, g in pairs])
-
-
-Found = tuple[Finding, Signal]
-
-
-def signal_of(model: Model, trials: Sequence[Trial], i: int) -> Signal:
-    """Return state i of some trials."""
-    unit, columns = list(model.states.values())[i], [trial.states[:, i] for trial in trials]
-    name, angle = model.state_names[i], bool(model.angle_mask[i])
-    return Signal(name, unit, angle, columns, trials[0].dt)
-
-
-def judge_signal(signal: Signal) -> tuple[list[Finding], Signal]:
-    """Return the findings of a signal, and the corrected signal."""
-    findings = list[Finding]()
-    for look in (_wrapped, _dropouts, _held, _stuck):
-        if seen := look(signal):
-            findings.append(seen[0])
-            signal = seen[1]
-    return findings, signal
-
-
-def runs(x: Array) -> tuple[Any, Any]:
-    """Return starts and lengths of the runs of equal samples in x (T,); NaN equals nothing."""
-    edges = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]]))
-    return edges[:-1], np.diff(edges)
+    findings, mended = list[Finding](), [np.array(trial.states) for trial in trials]
+    for i in shown:
+        name, unit = list(model.states.items())[i]
+        columns: Columns = [x[:, i] for x in mended]
+        if unit == "rad" and not model.angle_mask[i]:
+            columns, count = _unwrapped(columns)
+            said = found("sensor.samples", name, count=count)
+            one = Finding(name, said, "wrapped", corrected=True, keys={"unwrap": True})
+            findings += [one] * (count > 0)
+        for kind, look in (("dropout", _dropouts), ("held", _held), ("stuck", _stuck)):
+            sizes = np.concatenate([np.abs(np.diff(x)) for x in columns])
+            sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+            seen = look(columns, sizes, trials[0].dt) if len(sizes) >= FEWEST_SAMPLES else None
+            if seen:
+                gone, facts = seen
+                share, said = _share(gone), found("sensor.samples", name, **facts)
+                findings.append(Finding(name, said, kind, share=share, corrected=True))
+                columns = [np.where(g, np.nan, x) for g, x in zip(gone, columns, strict=True)]
+        for x, column in zip(mended, columns, strict=True):
+            x[:, i] = column
+    return findings, [replace(t, states=x) for t, x in zip(trials, mended, strict=True)]
 
 
 def _share(gone: Sequence[Any]) -> float:
     return float(np.concatenate(list(gone)).mean())
 
 
-def _wrapped(s: Signal) -> Found | None:
-    """Find jumps by a full turn, in radians or degrees, in an angle whose differences don't wrap.
+def _unwrapped(columns: Columns) -> tuple[Columns, int]:
+    """Return an angle without its jumps by a full turn, in radians or degrees; and their number.
 
     Each log may have a unit of its own; which one it is, the accounts of units tell.
     """
-    for turn in FULL_TURNS if s.unit == "rad" and not s.angle else ():
-        jumps = [_jumps(x, turn) for x in s.columns]
+    for turn in FULL_TURNS:
+        jumps = [_jumps(x, turn) for x in columns]
         if count := int(sum(np.abs(k).sum() for k in jumps)):
             ways = [turn * np.concatenate([[0.0], np.cumsum(k)]) for k in jumps]
-            whole = [x - way for x, way in zip(s.columns, ways, strict=True)]
-            one = s.told("wrapped", mended=True, count=count)
-            return replace(one, keys={"unwrap": True}), replace(s, columns=whole)
-    return None
+            return [x - way for x, way in zip(columns, ways, strict=True)], count
+    return columns, 0
 
 
 def _jumps(x: Array, turn: float) -> Array:
@@ -108,12 +79,16 @@ def _jumps(x: Array, turn: float) -> Array:
     return np.asarray(calm * np.nan_to_num(np.sign(steps) * (np.abs(size - turn) < 0.1 * turn)))
 
 
-def _dropouts(s: Signal) -> Found | None:
-    """Find a fixed value that the signal jumps to for single samples."""
-    if s.changes.size < FEWEST_SAMPLES:
-        return None
-    far, values = 10 * float(np.quantile(s.changes, NEARLY_ALL)), []
-    for x in s.columns:
+def _dropouts(columns: Columns, sizes: Array, dt: float) -> Gone | None:
+    """Find a fixed value that a signal jumps to for single samples.
+
+    Args:
+        columns: the samples.
+        sizes: of all changes from sample to sample, without zeros.
+        dt: time step [s].
+    """
+    far, values = 10 * float(np.quantile(sizes, NEARLY_ALL)), []
+    for x in columns:
         there = (np.abs(x[1:-1] - x[:-2]) > far) & (np.abs(x[1:-1] - x[2:]) > far)
         values += list(x[1:-1][there & (np.abs(x[2:] - x[:-2]) < far)])
     known, counts = np.unique(values, return_counts=True)
@@ -122,47 +97,45 @@ def _dropouts(s: Signal) -> Found | None:
     value = float(known[np.argmax(counts)])
     gone = [
         (x == value) & ((np.abs(x - np.roll(x, 1)) > far) | (np.abs(x - np.roll(x, -1)) > far))
-        for x in s.columns
+        for x in columns
     ]
-    share = _share(gone)
-    return s.told("dropout", share, mended=True, low=f"{value:g}", share=share), s.without(gone)
+    return gone, {"low": f"{value:g}", "share": _share(gone)}
 
 
-def _held(s: Signal) -> Found | None:
+def _held(columns: Columns, sizes: Array, dt: float) -> Gone | None:
     """Find a signal that repeats every value: the sensor or its topic is slower than the log."""
     lengths, gone = list[int](), list[Any]()
-    for x in s.columns:
-        start, length = runs(x)
+    for x in columns:
+        start, length = _runs(x)
         lengths += list(length[np.isfinite(np.diff(x[start], append=np.nan))])
         gone.append(np.isfinite(x) & ~np.isin(np.arange(len(x)), start))
-    if len(lengths) < FEWEST_SAMPLES or not s.changes.size:
-        return None
-    coarse = np.quantile(s.changes, 0.5) < 2.5 * s.changes.min()  # coarse quantisation
+    coarse = np.quantile(sizes, 0.5) < 2.5 * sizes.min()  # coarse quantisation
     if coarse or np.mean(np.array(lengths) >= 2) < NEARLY_ALL:
         return None
-    one = s.told("held", _share(gone), mended=True, every=float(np.median(lengths)) * s.dt)
-    return replace(one, mend=one.said), s.without(gone)
+    return gone, {"every": float(np.median(lengths)) * dt}
 
 
-def _stuck(s: Signal) -> Found | None:
+def _stuck(columns: Columns, sizes: Array, dt: float) -> Gone | None:
     """Find a value that stays exactly constant and then jumps to the true one."""
-    if s.changes.size < FEWEST_SAMPLES:
-        return None
-    far, gone, longest = 2 * float(np.median(s.changes)), [], 0
-    for x in s.columns:
+    far, gone, longest = 2 * float(np.median(sizes)), [], 0
+    for x in columns:
         flat = np.zeros(len(x), bool)
-        for start, length in zip(*runs(x), strict=True):
+        for start, length in zip(*_runs(x), strict=True):
             end = start + length
             if length < STEPS_TO_JUDGE or not start or end >= len(x):
                 continue
             onward = abs(x[end + 1] - x[end]) if end + 1 < len(x) else np.inf
-            if abs(x[end] - x[start]) > max(far, 3 * onward):
+            if abs(x[end] - x[start]) > max(far, FACTOR * onward):
                 flat[start + 1 : end] = True
                 longest = max(longest, int(length))
         gone.append(flat)
-    if not longest:
-        return None
-    return s.told("stuck", _share(gone), mended=True, stuck=longest * s.dt), s.without(gone)
+    return (gone, {"stuck": longest * dt}) if longest else None
+
+
+def _runs(x: Array) -> tuple[Any, Any]:
+    """Return starts and lengths of the runs of equal samples in x (T,); NaN equals nothing."""
+    edges = np.flatnonzero(np.concatenate([[True], np.diff(x) != 0, [True]]))
+    return edges[:-1], np.diff(edges)
 
 
 def quantum(columns: Sequence[Array]) -> float:

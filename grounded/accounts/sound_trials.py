@@ -12,7 +12,6 @@ What is certain is corrected in the trials passed on; what can't be is refused, 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,10 +19,9 @@ from grounded.accounts.ages import Ages
 from grounded.accounts.commands import judge_clocks, judge_signs
 from grounded.accounts.finding import Finding, Preflight, UnusableTrials
 from grounded.accounts.judge import Verdict, judge
-from grounded.accounts.kinematics import Gap, gaps
 from grounded.accounts.levels import GROSS, HALF
 from grounded.accounts.reported import keys, names_of, reported
-from grounded.accounts.signals import judge_signal, signal_of
+from grounded.accounts.signals import judge_samples
 from grounded.accounts.table import Told
 from grounded.accounts.time_step import judge_resolution, judge_time_step
 from grounded.findings import Quantity
@@ -65,7 +63,7 @@ def sound_trials(
     shown = [i for i, name in enumerate(model.state_names) if name not in hidden]
     with np.errstate(all="ignore"):
         # samples first, since a drop-out looks like motion
-        found, used = _samples(model, used, shown)
+        found, used = judge_samples(model, used, shown)
         verdict = judge(model, used, shown)
         refuse(model, used, verdict)
         found += [one for told in verdict.told for one in corrections(model, used, told)]
@@ -77,7 +75,7 @@ def sound_trials(
         # what is late, on trials in their units
         ages = Ages(model, used, shown)
         found += ages.findings(one_message)
-        found += _unexplained(model, ages.trials, verdict, shown)
+        found += _unexplained(model, verdict)
         found += judge_time_step(model, ages.trials, ages.shown)
     judge_clocks(model, ages.trials, shown)
     for group in (ages.trials[:first], ages.trials[first:] if first else ()):
@@ -85,23 +83,6 @@ def sound_trials(
     return Preflight(
         tuple(found), tuple(ages.trials), frozenset(ages.in_step), frozenset(ages.refuted)
     )
-
-
-def _samples(
-    model: Model, trials: Sequence[Trial], shown: Sequence[int]
-) -> tuple[list[Finding], list[Trial]]:
-    """Check the samples of each sensor on its own; return the findings and the mended trials."""
-    found, mended = list[Finding](), list(trials)
-    for i in shown:
-        signal = signal_of(model, mended, i)
-        findings, after = judge_signal(signal)
-        found += findings
-        if after is not signal:
-            for k, x in enumerate(after.columns):
-                states = np.array(mended[k].states)
-                states[:, i] = x
-                mended[k] = replace(mended[k], states=states)
-    return found, mended
 
 
 def refuse(model: Model, trials: Sequence[Trial], verdict: Verdict) -> None:
@@ -136,18 +117,12 @@ def corrections(model: Model, trials: Sequence[Trial], told: Told) -> Iterator[F
             yield Finding(name, said, kind, scale=account.factor, corrected=True, keys=mended)
 
 
-def _unexplained(
-    model: Model, trials: Sequence[Trial], verdict: Verdict, shown: Sequence[int]
-) -> Iterator[Finding]:
-    """Yield a finding for each row of several sensors that most trials contradict grossly."""
-    rows = [row for row in verdict.open if len(row.by) > 1]
-    every = [gaps(model, trial, rows) for trial in trials]
-    for row in rows:
-        some = [one[row] for one in every if row in one]
-        gap = Gap(*np.median(some, axis=0)) if some else None
-        if gap is None or gap.share < GROSS or gap.varying < HALF:
+def _unexplained(model: Model, verdict: Verdict) -> Iterator[Finding]:
+    """Yield a finding for each row of several sensors that the trials contradict grossly."""
+    for row, gap in verdict.open.items():
+        if len(row.by) < 2 or gap.share < GROSS or gap.varying < HALF:
             continue  # at rest in a current
         name, *by = (model.state_names[i] for i in (row.i, *row.by))
         off = Quantity(float(gap.rate), per_second(model.states[name]))
         said = told_("sensor.mismatch", name, of=tuple(by), off=off)
-        yield Finding(name, said, "mismatch", mend=said)
+        yield Finding(name, said, "mismatch")
