@@ -34,6 +34,7 @@ class Finding(Document):
         share: share of the samples affected, 0 to 1.
         corrected: whether the trials were corrected before the physics was identified.
         keys: keys of the signal's [log] table that correct the logs as well.
+        mend: the finding whose remedy says what to change, where no key of [log] corrects it.
         source: the position from which a velocity was computed.
     """
 
@@ -46,6 +47,7 @@ class Finding(Document):
     share: float = field(default=float("nan"), metadata={"brief": True})
     corrected: bool = False
     keys: Mapping[str, Any] = field(default_factory=dict)
+    mend: told.Finding | None = field(default=None, metadata={"brief": True})
     source: str = field(default="", metadata={"brief": True})
 
     @property
@@ -63,8 +65,8 @@ class Finding(Document):
 
     @property
     def advice(self) -> str:
-        """What to change in the model, "" for nothing."""
-        return self.said.remedy if self.kind == "time step" and self.said else ""
+        """What to change where no key of [log] corrects it, "" for nothing."""
+        return self.mend.remedy if self.mend is not None and self.mend.printable else ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the fields by JSON key, with what they say in words."""

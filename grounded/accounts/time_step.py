@@ -57,7 +57,7 @@ def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int])
         substeps=model.substeps * 2 ** (len(runs) - 2) if enough else 0,
         file="model.py",
     )
-    return [Finding(model.state_names[worst], said, "time step")]
+    return [Finding(model.state_names[worst], said, "time step", mend=said)]
 
 
 def _after_a_step(model: Model, x: Array, u: Array, dt: float, parts: int) -> Array:
