@@ -484,7 +484,6 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     sent = np.clip(trial.inputs[:T], policy.low, policy.high)
     past = policy.past if trial.start_inputs is None else trial.start_inputs
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
-    samples = _Samples.of(log, round(start * 1e9), T)
 
     def asked(states: Array) -> Array:
         return policy.commands(states, past, sent[None])
@@ -497,7 +496,8 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     if policy.gain is None:
         found = np.zeros((1, T, len(policy.state_names)))
     else:
-        tried = [samples.best(scores, held) for held in (True, False)]
+        topics, aged = _aged(log, round(start * 1e9), T)
+        tried = [_likeliest(one, topics, scores) for one in aged]
         found = min(tried, key=lambda one: scores(one)[0])
     u = asked(found)[0]
     free = ((u > policy.low) & (u < policy.high)) | ((sent > policy.low) & (sent < policy.high))
@@ -505,55 +505,45 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     return ActedOn(np.where(free.any(axis=1), off, np.nan), u, size)
 
 
-@dataclass(frozen=True, eq=False)
-class _Samples:
-    """The samples of a log's states around the times at which commands were sent."""
+def _aged(log: Recording, start: int, steps: int) -> tuple[list[list[int]], list[Array]]:
+    """Return the states of a log at all ages that they may have had when commands were sent.
 
-    states: tuple[Samples, ...]
-    guessed: tuple[bool, ...]  # whether a state was estimated by the smoother, not logged
-    topics: tuple[tuple[int, ...], ...]  # states with the same time stamps
-    at: Ints  # (T,) when commands were sent [ns]
-    ages: Array  # the ages to try for each topic [s]
+    Args:
+        log: the log.
+        start: when the run begins, in ns after the log's first sample.
+        steps: of the run, T.
 
-    @classmethod
-    def of(cls, log: Recording, start: int, steps: int) -> _Samples:
-        names, inputs = log.names
-        states = tuple(tidy(n, log.series[n], unwrap=n in log.angles) for n in names)
-        together = dict[bytes, list[int]]()
-        for i, one in enumerate(states):
-            together.setdefault(one.t.tobytes(), []).append(i)
-        sent = [tidy(n, log.series[n], unwrap=False) for n in inputs]
-        begin = log.whole.origin_ns + start
-        finest = max(min(one.interval for one in states) / AGES_BETWEEN, OLDEST * log.dt / AGES)
-        return cls(
-            states,
-            tuple(n not in log.logged for n in names),
-            tuple(tuple(some) for some in together.values()),
-            _sent_at(sent, begin, log.dt, steps),
-            np.arange(-2 * finest, OLDEST * log.dt, finest),
-        )
+    Returns:
+        The groups of states with the same time stamps, which are equally old; and the states,
+        (ages, T, n): held from sample to sample (but for those that were estimated), and between.
+    """
+    names, inputs = log.names
+    states = [tidy(n, log.series[n], unwrap=n in log.angles) for n in names]
+    together = dict[bytes, list[int]]()
+    for i, one in enumerate(states):
+        together.setdefault(one.t.tobytes(), []).append(i)
+    sent = [tidy(n, log.series[n], unwrap=False) for n in inputs]
+    finest = max(min(one.interval for one in states) / AGES_BETWEEN, OLDEST * log.dt / AGES)
+    ages = np.arange(-2 * finest, OLDEST * log.dt, finest)
+    at = _sent_at(sent, log.whole.origin_ns + start, log.dt, steps)
+    at = at - np.round(ages[:, None] * 1e9).astype(np.int64)
+    held, between = list[Array](), list[Array]()
+    for name, one in zip(names, states, strict=True):
+        t, y = one.t - one.t[0], one.y
+        last = np.clip(np.searchsorted(one.t, at, "right") - 1, 0, len(t) - 1)
+        between.append(np.interp((at - one.t[0]).ravel(), t, y).reshape(at.shape))
+        held.append(y[last] if name in log.logged else between[-1])
+    return [*together.values()], [np.stack(some, axis=2) for some in (held, between)]
 
-    def best(self, scores: Callable[[Array], Array], held: bool) -> Array:
-        """Return the states at the ages that fit best, (1, T, n)."""
-        first = np.stack([self._aged(i, self.ages, held) for i in range(len(self.states))], axis=2)
-        found = first[[int(np.argmin(scores(first)))]]
-        for _ in range(ROUNDS if len(self.topics) > 1 else 0):
-            for topic in self.topics:
-                tried = np.repeat(found, len(self.ages), axis=0)
-                tried[:, :, topic] = first[:, :, topic]
-                found = tried[[int(np.argmin(scores(tried)))]]
-        return found
 
-    def _aged(self, i: int, ages: Array, held: bool) -> Array:
-        """Return a state at all ages when each command was sent, (A, T)."""
-        one = self.states[i]
-        at = self.at - np.round(ages[:, None] * 1e9).astype(np.int64)
-        last = np.clip(np.searchsorted(one.t, at, "right") - 1, 0, len(one.t) - 1)
-        if held and not self.guessed[i]:
-            return one.y[last]
-        t = one.t - one.t[0]
-        between: Array = np.interp((at - one.t[0]).ravel(), t, one.y).reshape(at.shape)
-        return between
+def _likeliest(aged: Array, topics: list[list[int]], scores: Callable[[Array], Array]) -> Array:
+    """Return the states at the ages that fit best, (1, T, n), of those by `_aged`."""
+    found = aged[[int(np.argmin(scores(aged)))]]
+    for topic in topics * ROUNDS if len(topics) > 1 else ():
+        tried = np.repeat(found, len(aged), axis=0)
+        tried[:, :, topic] = aged[:, :, topic]
+        found = tried[[int(np.argmin(scores(tried)))]]
+    return found
 
 
 def _sent_at(sent: Sequence[Samples], begin: int, dt: float, steps: int) -> Ints:
