@@ -3,6 +3,7 @@
 import numpy as np
 from rosbags.rosbag2 import Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 OTHERS = {
@@ -138,19 +139,9 @@ def boat_bag(folder):
 
 def turned(roll, pitch, yaw):
     """Return the quaternion (x, y, z, w) of Rz(yaw) Ry(pitch) Rx(roll), and that matrix."""
-    angles = np.array([roll, pitch, yaw])
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
-    rx = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    ry = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    rz = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles / 2), np.sin(angles / 2)
-    q = (
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
-        cr * cp * sy - sr * sp * cy,
-        cr * cp * cy + sr * sp * sy,
-    )
-    return T["geometry_msgs/msg/Quaternion"](*map(float, q)), rz @ ry @ rx
+    rotation = Rotation.from_euler("ZYX", [yaw, pitch, roll])
+    q = map(float, rotation.as_quat())
+    return T["geometry_msgs/msg/Quaternion"](*q), rotation.as_matrix()
 
 
 def drone_bag(folder, turning=0.0):

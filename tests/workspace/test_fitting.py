@@ -1,5 +1,6 @@
-"""`fit` in a workspace: sensors first; what a sensor does is mended in [log] or in the program."""
+"""`fit` in a workspace, what is mended in [log] or the program; names are one policy, verified."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,11 +15,14 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.rollout import simulate
 from grounded.trial import Trial
 from grounded_trials import Workspace
+from grounded_trials.store.documents import read_document
 from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.where_to_mend import where_to_mend
-from workspaces import edit, make
+from reported import copied
+from workspaces import CONFIG, edit, make
 
 DT = 0.05
 
@@ -195,3 +199,120 @@ def test_an_offset_that_is_found_adds_to_that_of_log(w, has, mended):
     compass = Finding("v", None, "sign", keys={"scale": -1.0, "offset": 1.5})
     (one,) = where_to_mend(w, [used], [compass])
     assert keys_of(one.log) == mended
+
+
+def learnt(folder, trials=2, **files):
+    ended = Workspace(make(folder, **files).folder)
+    ended.learn(trials)
+    return ended
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return learnt(tmp_path_factory.mktemp("identity") / "w")
+
+
+@pytest.fixture
+def ended(made, tmp_path):
+    return Workspace(shutil.copytree(made.folder, tmp_path / "w"))
+
+
+def test_every_flipped_bit_of_a_diagnosis_is_found(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    ended = Workspace(folder)
+    path = folder / "reports" / "diagnosis.json"
+    data, silent = path.read_bytes(), 0
+    assert read_diagnosis(ended.reports) is not None
+    for bit in range(0, 8 * len(data), 31):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        path.write_bytes(flipped)
+        try:
+            read_document(path)
+            silent += 1
+        except GroundedError:
+            pass
+    assert silent == 0 and len(data) > 1500
+    path.write_bytes(data[:700] + bytes([data[700] ^ 4]) + data[701:])
+    assert [one.file for one in ended.verify().damaged] == [str(path)]
+    with pytest.raises(GroundedError, match="diagnose again"):
+        ended.adopt("viscous_friction:v")
+
+
+def test_a_diagnosis_without_a_checksum_is_not_adopted(cart, tmp_path):
+    folder = copied(cart, tmp_path / "w")
+    path = folder / "reports" / "diagnosis.json"
+    text = path.read_text()
+    path.write_text("{" + text.split(",", 1)[1])
+    with pytest.raises(GroundedError, match=holding("diagnosis.json", "checksum")):
+        Workspace(folder).adopt("viscous_friction:v")
+
+
+def test_a_deleted_trial_is_found_the_last_one_too(ended, which=-1):
+    ended.propose()  # this hand-out has seen the last trial
+    trials = sorted(ended.store.folder.glob("t*.mcap"))
+    assert ended.verify().damaged == ()
+    trials[which].unlink()
+    (found,) = ended.verify().damaged
+    assert "was removed" in found.reason
+    assert ended.report().findings.lost
+
+
+def test_a_deleted_candidate_is_found_unless_a_trial_carries_it(ended):
+    waiting = ended.propose().candidate.id
+    ended.candidate_path("c0001").unlink()
+    assert ended.verify().damaged == ()
+    ended.candidate_path(waiting).unlink()
+    (found,) = ended.verify().damaged
+    assert waiting in found.file
+
+
+def test_joined_workspaces_never_mix_two_policies_of_one_name(ended, tmp_path):
+    config = CONFIG.replace("max_trials", "refit = true\nmax_trials")  # the same task
+    other = learnt(tmp_path / "other", config=config)
+    assert other.task.hash == ended.task.hash
+    assert other.candidate_bytes("c0002") != ended.candidate_bytes("c0002")
+    before = ended.status()
+    for path in (other.folder / "trials").iterdir():
+        if not (ended.store.folder / path.name).exists():
+            shutil.copy(path, ended.store.folder)
+    now = ended.status()
+    tried = now.standing.history[1]
+    assert len(tried.trials) == 1 and tried.utility == before.standing.history[1].utility
+    assert len(ended.trials()) > len(before.standing.history)
+    (name,) = {t.trial.candidate for t in ended.trials() if "~" in t.trial.candidate}
+    assert name.startswith("c0002~")
+    assert "search.uncounted" in {one.code for one in now.findings}
+    assert ended.verify().damaged == ()
+    ended.candidate_path("c0002").unlink()  # and the first that ran it has the name
+    assert len(ended.status().standing.history[1].trials) == 1
+
+
+def test_a_slow_propose_does_not_replace_what_was_handed_out(ended, monkeypatch):
+    from grounded.search import improve
+
+    plan, quick = improve.propose, []
+
+    def slow(*args, **kwargs):
+        proposal = plan(*args, **kwargs)
+        if not quick:  # somebody else proposes while this one plans
+            quick.append(True)
+            other = Workspace(ended.folder)
+            quick.append(other.propose().candidate.id)
+            quick.append(other.candidate_bytes(quick[1]))
+        return proposal
+
+    monkeypatch.setattr(improve, "propose", slow)
+    mine = ended.propose()
+    assert mine.candidate.id == quick[1] and not mine.proposal.is_new
+    assert ended.candidate_bytes(quick[1]) == quick[2] and ended.verify().damaged == ()
+
+
+def test_what_a_bare_trial_ran_is_kept_beside_it(ended, tmp_path):
+    from grounded_trials.store.trial_file import read_trial, write_trial
+
+    ran = ended.run(ended.propose().candidate.id)
+    trial, meta, _ = read_trial(ran.trial_file)
+    write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial", "task": meta["task"]})
+    found = ended.ingest(tmp_path / "bare.mcap")
+    assert ended.noted.ran.keys() == {found.sha256[:16]}

@@ -14,6 +14,7 @@ from grounded_trials.logs.signals import Series, SignalSpec
 from grounded_trials.starting.begin import begin
 from grounded_trials.workspace.intake.opening.estimating import EstimateTable, with_estimates
 from grounded_trials.workspace.user_files.config import set_keys
+from stepped import levels, stepped
 from workspaces import CONFIG, make
 
 TABLE = EstimateTable({"x": 0.002}, {})
@@ -24,21 +25,16 @@ def series(t, values, path="/csv.x"):
     return Series(SignalSpec(path, "log"), stamps, values, stamps, len(t), "table")
 
 
-def driven(every=0.01, until=6.0, size=1.0, noise=0.002, seed=0):
+def driven(until=6.0, fine=1e-3):
     """A cart heavier than the model's, pushed to and fro at 20 Hz: samples, and the true speed."""
-    fine = 1e-3
     t = np.arange(0, until, fine)
     force = np.where(t < 1, 0.0, 2 * np.sin(2 * np.floor(t / 0.05) * 0.05))
-    x = v = 0.0
-    path = []
-    for u in force:
-        path.append((x, v))
-        x, v = x + fine * v, v + fine * (u - 0.4 * v) / 1.3
-    x, v = size * np.transpose(path)
-    at = np.arange(0, len(t), round(every / fine))
-    rng = np.random.default_rng(seed)
+    x, v = stepped(
+        lambda x, u: np.array([x[1], (u[0] - 0.4 * x[1]) / 1.3]), force, fine, np.zeros(2), fine=1
+    )[:-1].T
+    noise = 0.002 * np.random.default_rng(0).standard_normal(len(t[::10]))
     found = {
-        "x": series(t[at], x[at] + size * noise * rng.standard_normal(len(at))),
+        "x": series(t[::10], x[::10] + noise),
         "force": series(t[::10], force[::10], "/csv.force"),
     }
     return found, t, v
@@ -67,7 +63,7 @@ def test_a_speed_is_estimated_in_steps_that_a_simulator_can_make(task):
             return {"x": s.x + dt * s.v, "v": s.v + dt * (a.force - 0.4 * s.v) / 1.3}
 
     model = Model(states=task.model.states, inputs=task.model.inputs, step=Simulator())
-    logged, t, v = driven(0.01)
+    logged, t, v = driven()
     error, _ = off(with_estimates(logged, TABLE, replace(task, model=model)), t, v)
     assert np.sqrt(np.mean(error**2)) < 0.06
 
@@ -79,31 +75,13 @@ def test_nothing_is_estimated_where_everything_is_measured(task):
     assert with_estimates(logged, table, task) == logged
 
 
-def disturbed(lag, friction, until=6.0, fine=1e-3):
-    """The crude model's cart with a lag or a friction."""
-    t = np.arange(0, until, fine)
-    held = np.floor(t / 0.05) * 0.05
-    force = np.where(t < 1, 0.0, 3 * np.sin(2 * held) + 1.5 * np.sign(np.sin(5 * held)))
-    x = v = u = 0.0
-    path = []
-    for k in force:
-        path.append((x, v))
-        u += fine / max(lag, fine) * (k - u)
-        x, v = x + fine * v, v + fine * (u - 0.2 * v - friction * np.tanh(v / 0.02))
-    x, v = np.transpose(path)
-    noisy = x[::10] + 0.002 * np.random.default_rng(0).standard_normal(len(x[::10]))
-    return {"x": series(t[::10], noisy), "force": series(t[::10], force[::10], "/u")}, t, v
-
-
 def test_trials_that_another_model_estimated_stay_and_are_told(tmp_path):
     lines = [f'[log.{k}.{n}]\npath = "/csv.{n}"' for k, n in (("state", "x"), ("input", "force"))]
     config = CONFIG + "\n".join([*lines, "[estimate]", "measured = { x = 0.002 }"])
     folder = make(tmp_path / "w", config=config).folder
-    for k in range(1):
-        logged, _, _ = disturbed(0.0, 0.8, until=4.0 + k)
-        t = logged["x"].t * 1e-9 + 100 * k
-        table = np.column_stack([t, logged["x"].values, logged["force"].values])
-        np.savetxt(tmp_path / f"{k}.csv", table, "%.5f", ",", header="t,x,force", comments="")
+    logged, _, _ = driven()
+    table = np.column_stack([logged["x"].t * 1e-9, logged["x"].values, logged["force"].values])
+    np.savetxt(tmp_path / "0.csv", table, "%.5f", ",", header="t,x,force", comments="")
     first = Workspace(folder).ingest(tmp_path / "0.csv", data=True)
     before = Workspace(folder).trials()[0].measured.states
     set_keys(folder / "grounded.toml", "model", effects=[{"name": "coulomb_friction:v", "c": 0.8}])
@@ -140,44 +118,31 @@ model = Model(states={"upper": "V", "lower": "V"}, inputs={"pump": "V"}, params=
 """
 
 
-def flow(upper, lower, pump, p):
-    out = np.sqrt(np.maximum([upper, lower], 1e-3))
-    return p["k4"] * pump - p["k1"] * out[0], p["k2"] * out[0] - p["k3"] * out[1]
-
-
-def measured(rng):
-    """Return pump voltages, and both levels over time."""
-    pump = np.repeat(rng.uniform(1.0, 4.0, ROWS // 20), 20)
-    levels = np.empty((ROWS, 2))
-    levels[0] = 5.0, 4.0
-    for k in range(ROWS - 1):
-        x = levels[k].copy()
-        for _ in range(8):
-            x = x + DT / 8 * np.array(flow(*x, pump[k], TRUE))
-        levels[k + 1] = x
-    return pump, levels
+def flow(x, u, p=TRUE):
+    out = np.sqrt(np.maximum(x, 1e-3))
+    return np.array([p["k4"] * u[0] - p["k1"] * out[0], p["k2"] * out[0] - p["k3"] * out[1]])
 
 
 @pytest.fixture(scope="module")
 def tanks(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("tanks"), np.random.default_rng(4)
-    pump, levels = measured(rng)
-    seen = levels[:, 1] + 0.01 * rng.standard_normal(ROWS)
+    pump = levels(rng, ROWS // 20, 20, 1.5)[:, 0] + 2.5
+    path = stepped(flow, pump, DT, [5.0, 4.0], fine=8)[:-1]
+    seen = path[:, 1] + 0.01 * rng.standard_normal(ROWS)
     log = folder / "log.csv"
     table = np.column_stack([DT * np.arange(ROWS), pump, seen])
     np.savetxt(log, table, "%.6f", ",", header="time_s,pump,lower", comments="")
     (folder / "model.py").write_text(MODEL % NOMINAL)
-    begun = begin(folder / "w", log, model=folder / "model.py")
+    begin(folder / "w", log, model=folder / "model.py")
     toml = folder / "w" / "grounded.toml"
     assert "[estimate]" in toml.read_text()  # nothing measures the upper level
     workspace = Workspace(folder / "w")
     workspace.ingest(log, data=True)
-    return begun, workspace, levels
+    return workspace
 
 
 def test_a_fit_moves_though_the_hidden_state_bends_the_gradient(tanks):
-    _, workspace, _ = tanks
-    found = workspace.fit().fit
+    found = tanks.fit().fit
     assert found.status.startswith("converged")
     value = {name: e.value for name, e in found.params.items()}
     # the scale of the hidden level is free: what it does to the measured one is not

@@ -1,4 +1,4 @@
-"""A run that should not count, and a log that ends before the run does."""
+"""A run that should not count, a log that ends early, and how exactly a robot is placed."""
 
 from dataclasses import replace
 
@@ -13,6 +13,12 @@ from grounded.plant import Plant
 from grounded.trial import Trial
 from grounded_trials import Workspace
 from grounded_trials.store.trial_file import read_trial, write_trial
+from grounded_trials.workspace.candidates.proposing import propose_in
+from grounded_trials.workspace.candidates.running import run_candidate
+from grounded_trials.workspace.discarding import set_aside
+from grounded_trials.workspace.intake import gone_wrong
+from grounded_trials.workspace.intake.gone_wrong import placing
+from grounded_trials.workspace.intake.ingest import ingest_log
 from recorded import LOGGED, record
 from workspaces import MODEL, REAL, make
 
@@ -208,3 +214,59 @@ def test_a_state_without_values_in_a_log_that_goes_on_is_named(tmp_path):
     found = w.ingest(log)
     (told,) = of_code(found, "run.early", "run.failed")
     assert told.facts["silent"] == ("x",) and not of_code(found, "log.short")
+
+
+@pytest.fixture
+def rig(tmp_path):
+    return make(tmp_path / "w")
+
+
+def ran_on(rig):
+    return run_candidate(rig, propose_in(rig).candidate.id).trial_file
+
+
+def placed(rig, tmp_path, ran, off):
+    """Ingest a run that began `off` away."""
+    moved = np.array(ran.states)
+    moved[0, 0] += off
+    write_trial(tmp_path / "t.mcap", replace(ran, states=moved), {"kind": "trial"})
+    return ingest_log(rig, tmp_path / "t.mcap", ran.candidate or "c0001")
+
+
+def test_the_scatter_of_starts_is_learnt_from_discarded_runs_too(rig, tmp_path, monkeypatch):
+    ran, *_ = read_trial(ran_on(rig))
+    monkeypatch.setattr(gone_wrong, "worth_of_start", lambda *_: 0.9 * rig.task.utility(ran))
+    assert of_code(placed(rig, tmp_path, ran, 0.15), "run.start_spoils")
+    for off in (-0.13, 0.11):
+        set_aside(rig, "discard", [placed(rig, tmp_path, ran, off).trial], "")
+        rig.forget()
+    rms, runs = placing(rig, rig.read())
+    assert runs == 3 and rms[0] == pytest.approx(1.4826 * 0.13)
+    found = placed(rig, tmp_path, ran, -0.14)
+    (told,) = of_code(found, "run.start*")
+    assert (told.code, told.facts["runs"]) == ("run.start", 3)
+    assert told.facts["rms"].value == pytest.approx(1.4826 * 0.13)
+    assert found.then.verb == "propose"
+
+
+@pytest.mark.parametrize(("share", "code"), [(-0.9, "run.start_spoils"), (0.9, "run.start")])
+def test_a_run_that_is_better_from_either_start_counts(rig, monkeypatch, share, code):
+    """`share` of its cost is what its start has lost, or won if below 0."""
+    worse = ran_on(rig)
+    ingest_log(rig, worse)
+    worse, better = (read_trial(file)[0] for file in (worse, ran_on(rig)))
+    utility = rig.task.utility(better)
+    assert utility > rig.task.utility(worse)
+    monkeypatch.setattr(gone_wrong, "worth_of_start", lambda *_: share * utility)
+    moved = np.array(better.states)
+    moved[0, 0] += 0.01
+    assert gone_wrong.Run(rig, replace(better, states=moved)).begun_elsewhere().code == code
+
+
+def test_a_discarded_run_that_began_elsewhere_says_nothing_about_the_placing(rig, tmp_path):
+    ran, *_ = read_trial(ran_on(rig))
+    for off in (0.01, -0.01, 0.9):
+        last = placed(rig, tmp_path, ran, off).trial
+    set_aside(rig, "discard", [last], "")
+    rig.forget()
+    assert placing(rig, rig.read())[0][0] == pytest.approx(1.4826 * 0.01)

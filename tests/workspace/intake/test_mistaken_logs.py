@@ -367,69 +367,18 @@ def test_a_first_plan_that_its_limits_keep_from_the_target_says_so(tmp_path, lim
     assert all(one.about == ("force",) for one in told)
 
 
-ROVER = """import numpy as np
-
-from grounded import Model, Param
-
-model = Model(
-    states={"x": "m", "y": "m", "psi": "rad", "u": "m/s", "r": "rad/s"},
-    inputs={"drive": "V", "turn": "V"},
-    params={"drag": Param(4.0, "N s/m", 1.0, 12.0)},
-    angles=("psi",),
-    derivative=lambda s, a, p: {
-        "x": s.u * np.cos(s.psi),
-        "y": s.u * np.sin(s.psi),
-        "psi": s.r,
-        "u": (a.drive - p.drag * s.u) / 6,
-        "r": (1.5 * a.turn - s.r) / 0.4,
-    },
-)
-"""
-
-
-ROVER_CONFIG = """[model]
-file = "model.py"
-[task]
-dt = 0.05
-horizon = 120
-target = "target.csv"
-start = { u = 1.0 }
-[reward]
-state = { x = 4.0, y = 4.0, psi = 0.5, u = 0.5 }
-input_change = { drive = 0.01, turn = 0.01 }
-[limits]
-drive = [-10.0, 15.0]
-turn = [-2.0, 2.0]
-[system]
-model = "model.py"
-noise.measurement = { x = 0.01, y = 0.01, psi = 0.004, u = 0.01, r = 0.01 }
-"""
-
-
-@pytest.fixture(scope="module")
-def rover_run(tmp_path_factory):
-    """A rover's workspace, and a run of its first candidate."""
-    t = np.arange(121) * 0.05
-    rows = np.column_stack([t, 3 * np.sin(t / 3), 3 - 3 * np.cos(t / 3), t / 3, 1 + 0 * t])
-    text = "\n".join(",".join(f"{v:.6f}" for v in row) for row in rows)
-    folder = tmp_path_factory.mktemp("w") / "w"
-    made = make(folder, config=ROVER_CONFIG, model=ROVER, target=f"t,x,y,psi,u\n{text}\n")
-    w = Workspace(made.folder)
-    w.propose()
-    w.run()
-    return w, *read_trial(next((w.folder / "runs").iterdir()))[:2]
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "names, factor",
     [
         ("psi r", -1.0),  # an IMU that is mounted upside down
-        ("drive turn", 1e3),  # in mV, both
+        ("port starboard", 1e3),  # in mV, both
     ],
 )
-def test_the_columns_and_their_factor_are_named(rover_run, tmp_path, names, factor):
-    w, trial, meta = rover_run
+def test_the_columns_and_their_factor_are_named(twin, tmp_path, names, factor):
+    w = twin
+    w.propose()
+    trial, meta, _ = read_trial(w.run().trial_file)
     by, sent = (
         [factor if name in names.split() else 1.0 for name in every]
         for every in (trial.state_names, trial.input_names)
