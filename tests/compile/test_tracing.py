@@ -85,16 +85,6 @@ def test_black_box_step_with_any_callable():
         assert np.allclose(plain(function, kind="step").step(X, U, P, 0.1), expected)
 
 
-def test_rk4_is_fourth_order_and_euler_first():
-    def rate(s, a, p):
-        return {"x": s.v, "v": -s.x}
-
-    exact = np.array([math.cos(0.1), -math.sin(0.1)])
-    x, u = np.array([[1.0, 0.0]]), np.zeros((1, 1))
-    assert np.abs(plain(rate).step(x, u, P, 0.1) - exact).max() < 1e-7
-    assert np.allclose(plain(rate, integrator="euler").step(x, u, P, 0.1), [[1.0, -0.1]])
-
-
 def test_derivatives_of_a_linear_model_are_exact():
     f, p = system("double_integrator", plain)
     x, u = np.random.default_rng(0).normal(size=(5, 2)), np.zeros((5, 1))

@@ -104,6 +104,8 @@ def test_verify_finds_every_flipped_bit() -> None:
         for what, bad in damaged(TRIAL, True, 1 if FULL else 17):
             path.write_bytes(bad)
             assert [d.file for d in store.verify()] == [str(path)], what
+            with pytest.raises(GroundedError):
+                store.read("t0001")
 
 
 CHILD = """

@@ -84,15 +84,6 @@ def test_each_input_moves_the_aircraft_its_way(straight, surface, change, rate, 
     assert sign * (rates(x, moved)[rate] - rates(x, u)[rate]) > 0.01
 
 
-def test_pulling_the_elevator_climbs(straight):
-    x, u = straight
-    pulled = u.copy()
-    pulled[model.input_names.index("elevator")] -= 0.03
-    path = fly(x, pulled, 1.0)
-    assert column(path, "theta")[-1] > column(path, "theta")[0]
-    assert column(path, "altitude")[-1] > 0.05
-
-
 def test_statically_stable_in_pitch_and_yaw(straight):
     x, u = straight
     up, right = x.copy(), x.copy()

@@ -315,23 +315,6 @@ def exported(tmp_path):
     return path
 
 
-def test_the_file_runs_alone_and_gives_the_same_inputs(exported, tmp_path):
-    alone = tmp_path / "robot"
-    alone.mkdir()
-    (alone / "run.py").write_bytes(Path(onboard.__file__).read_bytes())
-    code = (
-        "import run; r = run.load({path!r}, states=('x', 'v'))\n"
-        "print([float(r.action(0.1 * k, [0.1 * k, 0.0])[0]) for k in range(7)])\n"
-        "import sys; assert not any(name.startswith('grounded') for name in sys.modules)"
-    )
-    command = [sys.executable, "-I", "-c", f"import sys; sys.path.insert(0, {str(alone)!r})\n"]
-    command[-1] += code.format(path=str(exported))
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    here = Runner(short())
-    expected = [float(here.action(0.1 * k, [0.1 * k, 0.0])[0]) for k in range(7)]
-    assert ast.literal_eval(done.stdout) == expected
-
-
 def test_a_loaded_policy_has_the_horizon_that_the_docs_use(exported):
     assert onboard.load(exported).policy.horizon == short().horizon == H
 

@@ -255,12 +255,6 @@ def test_a_name_that_is_not_there():
         _ = grounded_trials.Workshop
 
 
-def test_a_folder_that_is_no_workspace(tmp_path):
-    with pytest.raises(GroundedError) as refused:
-        Workspace(tmp_path)
-    assert refused.value.then is not None and refused.value.then.verb == "init"
-
-
 def test_a_session_from_an_example_to_a_report(tmp_path):
     w = Workspace.create(tmp_path / "w", example="pendulum")
     first = w.propose()

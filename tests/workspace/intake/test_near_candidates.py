@@ -24,7 +24,6 @@ from grounded_trials.workspace.intake.opening.run_start import acted_on, recordi
 from grounded_trials.workspace.intake.recognise import stories_of_log
 from recorded import follow
 from small_tasks import plain_task
-from stepped import stepped
 from workspaces import CONFIG, make
 
 FULL = CONFIG.replace("[search]", '[search]\nstep = "full"\nrerun_incumbent = false') + (
@@ -94,19 +93,6 @@ def test_a_run_of_another_candidate_is_refused_and_named(ladder):
         why = refused(w, noisy(by_alpha[1], 0.003, seed, other=True), by_alpha[1 / 4], by_alpha)
         assert why.code == "log.another", seed
         assert why.facts["other"] != by_alpha[1 / 4].id, seed
-
-
-def test_manual_driving_is_refused(ladder, share=0.01):
-    """A person swings the cart, other than the manoeuvre does; its states follow."""
-    w, by_alpha = ladder
-    model, made, dt = w.task.model, by_alpha[1 / 8], w.config.task.dt
-    for swings in (0.5, 2.0):
-        for phase in (0.0, 3.0):
-            u = 3 * np.sin(np.linspace(0, 2 * np.pi * swings, 40) + phase)[:, None]
-            x = stepped(model, u, dt, w.task.start)
-            noise = np.random.default_rng(0).normal(size=(41, 2)) * share
-            driven = replace(noisy(made, 0.0, 0, other=False), states=x + noise, inputs=u)
-            assert refused(w, driven, made, by_alpha).about == ("force",), (swings, phase)
 
 
 def test_evidence_is_nats_that_grow_with_the_run_and_are_none_for_the_same_policy(ladder):
