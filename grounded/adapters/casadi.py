@@ -26,8 +26,7 @@ def model(
     states: Mapping[str, str],
     inputs: Mapping[str, str],
     params: Mapping[str, Param] | None = None,
-    angles: tuple[str, ...] = (),
-    name: str = "casadi",
+    **fields: Any,
 ) -> Model:
     """Return the Model of a CasADi function.
 
@@ -36,8 +35,7 @@ def model(
         states: unit by name, in the order of x.
         inputs: unit by name, in the order of u.
         params: `Param` by name, in the order of p.
-        angles: states whose differences wrap to [-pi, pi].
-        name: name of the model, for messages.
+        fields: other fields of `Model`: angles, roles, name ...
 
     Raises:
         GroundedError: if casadi is not installed, or the function's sizes do not match the names.
@@ -51,8 +49,8 @@ def model(
         sizes["own"] = f"{wanted[:short]} -> {len(states)}"
         raise refused("given.fit", function.name(), what="sizes", **sizes)
     stepper = CasadiStepper(function, states, inputs, params)
-    fields = {"states": states, "inputs": inputs, "params": params, "angles": angles, "name": name}
-    return model_of(stepper, **fields)
+    names = {"states": states, "inputs": inputs, "params": params}
+    return model_of(stepper, **{"name": "casadi"} | names | fields)
 
 
 class CasadiStepper(Stepper):

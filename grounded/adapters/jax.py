@@ -25,8 +25,7 @@ def model(
     states: Mapping[str, str],
     inputs: Mapping[str, str],
     params: Mapping[str, Param] | None = None,
-    angles: tuple[str, ...] = (),
-    name: str = "jax",
+    **fields: Any,
 ) -> Model:
     """Return the Model of a JAX function.
 
@@ -35,16 +34,15 @@ def model(
         states: unit by name, in the order of x.
         inputs: unit by name, in the order of u.
         params: `Param` by name, in the order of p.
-        angles: states whose differences wrap to [-pi, pi].
-        name: name of the model, for messages.
+        fields: other fields of `Model`: angles, roles, name ...
 
     Raises:
         GroundedError: if jax is not installed.
     """
     params = params or {}
     stepper = JaxStepper(step, states, inputs, params)
-    fields = {"states": states, "inputs": inputs, "params": params, "angles": angles, "name": name}
-    return model_of(stepper, **fields)
+    names = {"states": states, "inputs": inputs, "params": params}
+    return model_of(stepper, **{"name": "jax"} | names | fields)
 
 
 class JaxStepper(Stepper):

@@ -154,7 +154,8 @@ class MujocoStepper(Stepper):
     """Computes control steps of MuJoCo for many samples at a time."""
 
     source: Path | None = None  # the file that it was loaded from
-    differenced = True
+    without: tuple[str, ...] = ()  # joints of the file that are no states
+    differenced = True  # its derivatives are differences of `advance`
 
     def __init__(
         self,

@@ -2,7 +2,8 @@
 
 Model calls `step(s, a, p, dt)` with one sample (numbers) or N samples (arrays (N,)) per name.
 Libraries step arrays: states (N, n), inputs (N, m). `Stepper` converts between the two, for the
-step and for its derivatives.
+step and for its derivatives. What else a simulator knows, Model and its users look for by name on
+its stepper: `limits`, `ranges`, `latency`, `body`, `inverse`, `differenced` (see `mujoco`).
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from typing import Any
 import numpy as np
 
 from grounded.errors import needs
-from grounded.figures.figure import Body
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -23,28 +23,6 @@ class Stepper:
 
     def __init__(self, states: Iterable[str], inputs: Iterable[str], params: Iterable[str]) -> None:
         self.states, self.inputs, self.params = tuple(states), tuple(inputs), tuple(params)
-
-    differenced = False  # whether `derivatives` are differences of `advance`
-    without: tuple[str, ...] = ()  # joints of the model's file that are no states
-
-    @property
-    def body(self) -> Body | None:
-        """The body to draw in pictures; None if there is none."""
-        return None
-
-    @property
-    def limits(self) -> Mapping[str, tuple[float, float]]:
-        """Limits (low, high) by name, of those inputs that the model's file limits."""
-        return {}
-
-    @property
-    def ranges(self) -> Mapping[str, tuple[float, float]]:
-        """Ranges (low, high) by name, of those states that the model's file limits."""
-        return {}
-
-    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
-        """Return inputs (N, m) that lead from x (N, n) to about `after` (N, n); None if unknown."""
-        return None
 
     def __call__(
         self, s: Mapping[str, Any], a: Mapping[str, Any], p: Mapping[str, Any], dt: float
