@@ -276,14 +276,8 @@ def panel(
         note: text behind the title.
         kind: see `Panel`.
     """
-    # a loss is drawn as the cost -y; what is no loss is drawn as the smallest
     if loss:
-        losses = [-float(t["y"][t["y"] < 0].max()) for t in traces if (t["y"] < 0).any()]
-        losses += [-one["y0"] for one in shapes if one["type"] == "line" and one["y0"] < 0]
-        least = min(losses, default=1.0)
-        traces = [one | {"y": np.maximum(-one["y"], least)} for one in traces]
-        ends = ({end: max(-one[end], least) for end in ("y0", "y1")} for one in shapes)
-        shapes = [one | changed for one, changed in zip(shapes, ends, strict=True)]
+        traces, shapes = _costs(traces, shapes)
 
     # what must be seen: marks, and curves with a name, or all where none has one
     drawn = [one for one in traces if one["meta"]["style"] != "ghost"]
@@ -305,12 +299,11 @@ def panel(
     across, up = _axis(x_name, left, right), _axis(y_name, low, high)
     if whole:
         across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
-    for axis, logarithmic in ((across, log), (up, log or loss)):
-        if logarithmic:
-            ticks, sign = log_ticks(*axis["range"]), "−" * loss
-            axis |= {"type": "log", "tickvals": ticks, "ticktext": [f"{sign}{v:g}" for v in ticks]}
+    for axis in (across, up) if log else (up,) if loss else ():
+        ticks = log_ticks(*axis["range"])
+        axis |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
     if loss:
-        up["range"] = [high, low]
+        up |= {"range": [high, low], "ticktext": [f"−{text}" for text in up["ticktext"]]}
     if x_ticks:
         at, labels = zip(*x_ticks, strict=True)
         labels = tuple(label.replace("\n", "<br>") for label in labels)
@@ -319,15 +312,22 @@ def panel(
         up["scaleanchor"] = "x"
 
     # marks without a value are on the lower edge
-    edge = up["range"][0]
-    edge = 10.0**edge if log or loss else edge
-    data = [
-        one | {"y": np.where(np.isfinite(one["y"]), one["y"], edge)}
-        if one["meta"]["style"] in SYMBOLS
-        else one
-        for one in traces
-    ]
-    return Panel(title, data, {"xaxis": across, "yaxis": up, "shapes": [*shapes]}, note, kind)
+    edge = 10.0 ** up["range"][0] if log or loss else up["range"][0]
+    for one in dots:
+        one["y"][~np.isfinite(one["y"])] = edge
+    return Panel(title, traces, {"xaxis": across, "yaxis": up, "shapes": [*shapes]}, note, kind)
+
+
+def _costs(
+    traces: Sequence[Trace], shapes: Sequence[Trace]
+) -> tuple[Sequence[Trace], Sequence[Trace]]:
+    """Return losses as the costs -y; what is no loss is drawn as the smallest."""
+    values = [one["y"] for one in traces]
+    values += [np.array([one["y0"]]) for one in shapes if one["type"] == "line"]
+    least = min((-float(y[y < 0].max()) for y in values if (y < 0).any()), default=1.0)
+    ends = ({end: max(-one[end], least) for end in ("y0", "y1")} for one in shapes)
+    costs = [one | {"y": np.maximum(-one["y"], least)} for one in traces]
+    return costs, [one | changed for one, changed in zip(shapes, ends, strict=True)]
 
 
 def _positive(trace: Trace) -> Trace:
