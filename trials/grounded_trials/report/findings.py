@@ -200,27 +200,27 @@ def prediction_error(task: Task, run: Run) -> Array:
     return task.model.difference(run.trial.states, run.candidate.predicted_states[: T + 1])
 
 
-def off_target(findings: Findings, run: Run) -> list[Array]:
-    """Return the tracking errors (T + 1, n) of each trial of a run's candidate."""
-    runs = findings.runs_of(run.candidate.id)
-    return [tracking_error(findings.task, one.trial) for one in runs]
+def measures(findings: Findings, run: Run) -> dict[str, Array]:
+    """Return rms errors (n,) of all trials of a run's candidate, and the run's rms bias a second.
+
+    tracking_error, prediction_error: from the target, and from the candidate's own prediction;
+    bias_rate: of the crude model along the run.
+    """
+    task, trials = findings.task, findings.runs_of(run.candidate.id)
+    return {
+        "tracking_error": rms([tracking_error(task, one.trial) for one in trials]),
+        "prediction_error": rms([prediction_error(task, one) for one in trials]),
+        "bias_rate": rms([run.residual]) / task.dt,
+    }
 
 
-def off_prediction(findings: Findings, run: Run) -> list[Array]:
-    """Return the prediction errors (T + 1, n) of each trial of a run's candidate."""
-    runs = findings.runs_of(run.candidate.id)
-    return [prediction_error(findings.task, one) for one in runs]
-
-
-def rms(values: Array | list[Array]) -> Array:
+def rms(parts: Sequence[Array]) -> Array:
     """Return the root mean square of each column over its finite values; NaN if it has none."""
-    values = np.vstack(values) if isinstance(values, list) else values
+    values = np.vstack(parts)
     finite = np.isfinite(values)
     count = finite.sum(axis=0)
-    total = np.where(finite, values, 0.0) ** 2
-    return np.asarray(
-        np.sqrt(np.where(count > 0, total.sum(axis=0) / np.maximum(count, 1), np.nan))
-    )
+    total = (np.where(finite, values, 0.0) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan)))
 
 
 def selection(runs: Sequence[One], most: int) -> tuple[One, ...]:

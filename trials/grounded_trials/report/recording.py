@@ -32,14 +32,7 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.plain_file import unwritable
 from grounded_trials.report.bodies import body_in, finite, is_mechanism, reach, scene_of
-from grounded_trials.report.figures.gap import forecast_figures
-from grounded_trials.report.figures.runs import (
-    averaged,
-    bias_figure,
-    input_figure,
-    state_figure,
-    window_of,
-)
+from grounded_trials.report.figures.runs import all_figures, averaged, window_of
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.tables import about, counted, improved
 from grounded_trials.wording import figure, labelled, per_second
@@ -78,9 +71,10 @@ def write_recording(findings: Findings, path: Path) -> None:
 
 
 def over_time(findings: Findings) -> list[Figure]:
-    """Return the page's figures over time: states, inputs, bias, forecasts."""
-    made = (state_figure(findings), input_figure(findings), bias_figure(findings))
-    return [figure for figure in (*made, *forecast_figures(findings)[:1]) if figure is not None]
+    """Return the page's figures over time: states, inputs, bias, the first forecast."""
+    figures = {one.name: one for one in all_figures(findings)}
+    ahead = [name for name in figures if name.startswith(("forecast", "data-"))][:1]
+    return [figures[name] for name in (*FIRST, *ahead) if name in figures]
 
 
 def escaped(name: str) -> str:

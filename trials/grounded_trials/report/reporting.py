@@ -16,7 +16,7 @@ from grounded.figures.figure import Figure, typeset
 from grounded.result import Result
 from grounded_trials.report.figures.png import png as drawn
 from grounded_trials.report.figures.runs import all_figures
-from grounded_trials.report.findings import Findings, Run, off_prediction, off_target, rms
+from grounded_trials.report.findings import Findings, Run, measures
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.page import page
 from grounded_trials.store.store import made_folder, write_atomically
@@ -80,15 +80,10 @@ def _measures(findings: Findings, run: Run | None) -> dict[str, Any] | None:
     """Return a run's rms tracking error, prediction error and model bias, by state."""
     if run is None:
         return None
-    task = findings.task
-    measures = {
-        "tracking_error": rms(off_target(findings, run)),
-        "prediction_error": rms(off_prediction(findings, run)),
-        "bias_rate": rms(run.residual) / task.dt,
-    }
+    names = findings.task.model.state_names
     return {"candidate": run.candidate.id, "utility": findings.tried_of(run).utility} | {
-        name: dict(zip(task.model.state_names, map(float, values), strict=True))
-        for name, values in measures.items()
+        what: dict(zip(names, map(float, values), strict=True))
+        for what, values in measures(findings, run).items()
     }
 
 

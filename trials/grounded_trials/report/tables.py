@@ -7,30 +7,22 @@ files; the report for a terminal and the recording take the same sentences and t
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
-from grounded.diagnosis.telling import accuracy_figure, effect_table
+from grounded.diagnosis.telling import effect_table
 from grounded.diagnosis.telling import error_table as held_out_table
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.result import begun, measured_alike
 from grounded.search.difference import Difference, last_gain
-from grounded.search.pictures import MOST_DRAWN, few, search_figure
-from grounded_trials.report.figures.gap import forecast_figures, residual_figures
-from grounded_trials.report.figures.paths import crash, path_figure
-from grounded_trials.report.figures.runs import (
-    bias_figure,
-    error_figure,
-    input_figure,
-    state_figure,
-)
+from grounded.search.pictures import MOST_DRAWN, few
+from grounded_trials.report.figures.paths import crash
+from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import (
     Findings,
     compared,
-    off_prediction,
-    off_target,
-    rms,
+    measures,
 )
 from grounded_trials.wording import (
     count,
@@ -43,6 +35,12 @@ from grounded_trials.wording import (
 from grounded_trials.workspace.next_step import DIAGNOSE
 from grounded_trials.workspace.off_target import off_target_of
 
+MEASURES = {  # of a run, see `measures`
+    "tracking_error": "off target",
+    "prediction_error": "off prediction",
+    "bias_rate": "bias in 1 s",
+}
+AHEAD = ("forecast", "data-", "residual")  # names of figures of forecasts and residuals
 OPEN = 12  # largest number of candidates whose table is shown unfolded
 
 
@@ -146,44 +144,45 @@ def improved(findings: Findings) -> list[tuple[str, str]]:
 
 def sections(findings: Findings) -> list[tuple[str, list[Block]]]:
     """Return the page's sections (title, parts) in reading order, without empty ones."""
-    paths = _drawn(path_figure(findings), wide=True)
+    figures = {one.name: one for one in all_figures(findings)}
+    paths = _drawn(figures.get("paths"), wide=True)
     found = [
         ("Paths", [Block("run"), *paths] if paths and findings.runs else paths),
-        ("States", _drawn(state_figure(findings))),
-        ("Inputs", _drawn(input_figure(findings))),
-        ("Tracking error", _drawn(error_figure(findings)) + error_table(findings)),
-        ("Utility", _utility(findings)),
-        ("Bias", _drawn(bias_figure(findings))),
-        ("Gap: model against reality", _gap(findings)),
+        ("States", _drawn(figures.get("states"))),
+        ("Inputs", _drawn(figures.get("inputs"))),
+        ("Tracking error", _drawn(figures.get("error")) + error_table(findings)),
+        ("Utility", _utility(findings, figures)),
+        ("Bias", _drawn(figures.get("bias"))),
+        ("Gap: model against reality", _gap(findings, figures)),
         ("Task and model", _task(findings)),
     ]
     return [(title, blocks) for title, blocks in found if blocks]
 
 
-def _utility(findings: Findings) -> list[Block]:
+def _utility(findings: Findings, figures: Mapping[str, Figure]) -> list[Block]:
     if not findings.history:
         return []
     gain = last_gain(findings.history)
     sure = gain.to_finding().sentence if gain else ""
     wide = len(findings.history) <= OPEN
     return [
-        *_drawn(search_figure(findings.standing)),
+        *_drawn(figures.get("utility")),
         *([Block("text", f"{begun(sure)}.")] if sure else []),
         Block("folded", "All candidates", blocks=_candidates(findings), wide=wide),
     ]
 
 
-def _gap(findings: Findings) -> list[Block]:
+def _gap(findings: Findings, figures: Mapping[str, Figure]) -> list[Block]:
     """Errors of predictions, forecasts of the crude model beside the better one; then details."""
     diagnosis = findings.diagnosis
-    ahead = [b for each in forecast_figures(findings) for b in _drawn(each, title=True)]
-    lacking = [b for each in residual_figures(findings) for b in _drawn(each, title=True)]
+    accuracy, shown = figures.get("accuracy"), (n for n in figures if n.startswith(AHEAD))
+    ahead = [block for name in shown for block in _drawn(figures[name], title=True)]
     if diagnosis is None:
         command = Block("command", rendered(DIAGNOSE, findings.folder), "c-diagnose")
-        return [command, *ahead, *lacking]
+        return [command, *ahead]
     if diagnosis.no_cause:  # with too little data, what was fitted is no finding
-        return [*ahead, *lacking]
-    found = [*_drawn(accuracy_figure(diagnosis), title=True), *ahead, *lacking]
+        return ahead
+    found = [*_drawn(accuracy, title=True), *ahead]
     found += _titled("Errors of held-out predictions", "held-out", *held_out_table(diagnosis))
     return found + _titled("Effects that were compared", "effects", *effect_table(diagnosis))
 
@@ -226,9 +225,8 @@ def error_table(findings: Findings) -> list[Block]:
     task, runs = findings.task, [run for _, run in compared(findings)]
     if findings.best is None:
         return []
-    columns = {f"off target, {r.candidate.id}": rms(off_target(findings, r)) for r in runs}
-    columns |= {f"off prediction, {r.candidate.id}": rms(off_prediction(findings, r)) for r in runs}
-    columns |= {f"bias in 1 s, {r.candidate.id}": rms(r.residual) / task.dt for r in runs}
+    each = [(run.candidate.id, measures(findings, run)) for run in runs]
+    columns = {f"{what}, {of}": own[k] for k, what in MEASURES.items() for of, own in each}
     rows = [
         (name, shown(unit), *(figure(or_zero(value, *values), 3) for value in values))
         for (name, unit), *values in zip(

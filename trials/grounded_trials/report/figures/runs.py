@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -40,14 +41,15 @@ ITERATIONS = 5  # largest number of iterations whose bias is drawn
 MOST_MEANS = 100  # means of a noisy curve
 
 
-def all_figures(findings: Findings) -> list[Figure]:
+@lru_cache(maxsize=1)
+def all_figures(findings: Findings) -> tuple[Figure, ...]:
     """Return all figures of a report in reading order, without empty ones."""
     runs = (path_figure, state_figure, input_figure, error_figure, bias_figure)
     made = [search_figure(findings.standing), *(draw(findings) for draw in runs)]
     if findings.diagnosis is not None:
         made += gap_figures(findings.diagnosis)
     made += forecast_figures(findings) + residual_figures(findings)
-    return [figure for figure in made if figure is not None]
+    return tuple(figure for figure in made if figure is not None)
 
 
 def _compared(
