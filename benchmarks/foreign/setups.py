@@ -42,19 +42,19 @@ class Setup:
         return self.robot.run(policy)
 
 
-def cart(name: str, withheld: str, kind: str = "gentle", **what: object) -> Setup:
+def cart(name: str, withheld: str, kind: str = "gentle", **xml: object) -> Setup:
     task = mech.cart_task(kind)
-    return Setup(name, withheld, task, *mech.mujoco_setup(task, cart_xml(**what)))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, cart_xml(**xml)))
 
 
-def arm(name: str, withheld: str, delay: float = 0.0, **what: object) -> Setup:
+def arm(name: str, withheld: str, delay: float = 0.0, **xml: object) -> Setup:
     task = mech.arm_task()
-    return Setup(name, withheld, task, *mech.mujoco_setup(task, arm_xml(**what), delay))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, arm_xml(**xml), delay))
 
 
-def arm7(name: str, withheld: str, **what: float) -> Setup:
+def arm7(name: str, withheld: str, **xml: float) -> Setup:
     task = mech.arm7_task()
-    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**what)))
+    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**xml)))
 
 
 def shipped(
@@ -86,29 +86,31 @@ def car(name: str, withheld: str, kind: str, acceleration: float) -> Setup:
     return Setup(name, withheld, cars.task(acceleration), cars.robot(kind, acceleration))
 
 
-FRICTION = {"timestep": 0.002, "integrator": "implicitfast", "friction": 0.8}
+EULER = {"timestep": 0.002, "integrator": "implicitfast"}
+FRICTION = {**EULER, "part": {"friction": {"force": 0.8}}}
+LAG = {"part": {"lag": {"force": 0.05}}}
+LOAD, DRY = {"true": {"load": 0.5}}, {"friction": {"tau1": 0.6, "tau2": 0.6}}
+HEAVY = {"armature": {"tau1": 0.15, "tau2": 0.15}, "lag": {"tau1": 0.02, "tau2": 0.02}}
 SLIP = "slip, tyres, load"
 SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "cart-pole": (cart, "nothing", {}),
-    "cart-pole-integrator": (
-        cart, "implicit Euler of 2 ms", {"timestep": 0.002, "integrator": "implicitfast"},
-    ),
+    "cart-pole-integrator": (cart, "implicit Euler of 2 ms", EULER),
     "cart-pole-friction": (cart, "cart friction 0.8 N", FRICTION),
-    "cart-pole-lag": (cart, "activation filter 50 ms", {"lag": 0.05}),
+    "cart-pole-lag": (cart, "activation filter 50 ms", LAG),
     "swing-up": (cart, "nothing", {"kind": "smooth"}),
     "swing-up-friction": (cart, "cart friction 0.8 N", FRICTION | {"kind": "smooth"}),
-    "swing-up-lag": (cart, "activation filter 50 ms", {"kind": "smooth", "lag": 0.05}),
+    "swing-up-lag": (cart, "activation filter 50 ms", LAG | {"kind": "smooth"}),
     "swing-up-hasty": (cart, "nothing", {"kind": "hasty"}),
     "arm": (arm, "nothing", {"integrator": "RK4"}),
-    "arm-payload": (arm, "payload 0.5 kg", {"payload": 0.5}),
-    "arm-friction": (arm, "joint friction 0.6 N m", {"f1": 0.6, "f2": 0.6}),
-    "arm-friction-1": (arm, "friction 0.6 N m in joint 1", {"f1": 0.6}),
-    "arm-both": (arm, "payload and joint friction", {"payload": 0.5, "f1": 0.6, "f2": 0.6}),
+    "arm-payload": (arm, "payload 0.5 kg", {"part": LOAD}),
+    "arm-friction": (arm, "joint friction 0.6 N m", {"part": DRY}),
+    "arm-friction-1": (arm, "friction 0.6 N m in joint 1", {"part": {"friction": {"tau1": 0.6}}}),
+    "arm-both": (arm, "payload and joint friction", {"part": LOAD | DRY}),
     "arm-delay": (arm, "delay 30 ms", {"delay": 0.03}),
-    "arm-armature": (arm, "armature 0.1 kg m2", {"armature": 0.1}),
-    "arm-armature-lag": (
-        arm, "armature 0.15 kg m2, filter 20 ms", {"armature": 0.15, "lag": (0.02, 0.02)},
+    "arm-armature": (
+        arm, "armature 0.1 kg m2", {"part": {"armature": {"tau1": 0.1, "tau2": 0.1}}},
     ),
+    "arm-armature-lag": (arm, "armature 0.15 kg m2, filter 20 ms", {"part": HEAVY}),
     "arm-gear": (arm, "gear 0.8 of joint 1", {"gear": 0.8}),
     "arm7": (arm7, "nothing", {}),
     "arm7-payload": (arm7, "payload 1.4 kg", {"payload": 1.5}),

@@ -8,6 +8,7 @@ describes: a spring at a joint, or a pendulum that hangs from the tip.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -24,8 +25,8 @@ CART = """
   <option timestep="{timestep}" integrator="{integrator}"/>
   <worldbody>
     <body name="cart">
-      <joint name="x" type="slide" axis="1 0 0" frictionloss="{friction}" damping="{b}"
-       armature="{armature}" stiffness="{spring}"/>
+      <joint name="x" type="slide" axis="1 0 0" frictionloss="{friction[force]}" damping="{b}"
+       armature="{armature[force]}" stiffness="{spring}"/>
       <inertial pos="0 0 0" mass="{M}" diaginertia="0.1 0.1 0.1"/>
       <body name="pole">
         <joint name="theta" axis="0 1 0"/>
@@ -34,7 +35,7 @@ CART = """
       </body>
     </body>
   </worldbody>
-  <actuator><general name="force" joint="x" {actuator}/></actuator>
+  <actuator><general name="force" joint="x" {lag[force]}/></actuator>
 </mujoco>"""
 
 ARM = """
@@ -42,22 +43,23 @@ ARM = """
   <option timestep="{timestep}" integrator="{integrator}"/>
   <worldbody>
     <body name="upper">
-      <joint name="q1" axis="0 -1 0" frictionloss="{f1}" armature="{a1}" damping="{b1}"
-       stiffness="{spring}" springref="-90"/>
+      <joint name="q1" axis="0 -1 0" frictionloss="{friction[tau1]}" armature="{armature[tau1]}"
+       damping="{b1}" stiffness="{spring}" springref="-90"/>
       <inertial pos="0.25 0 0" mass="1.5" diaginertia="0.001 0.03125 0.03125"/>
       <body name="fore" pos="0.5 0 0">
-        <joint name="q2" axis="0 -1 0" frictionloss="{f2}" armature="{a2}" damping="{b2}"/>
+        <joint name="q2" axis="0 -1 0" frictionloss="{friction[tau2]}" armature="{armature[tau2]}"
+         damping="{b2}"/>
         <inertial pos="0.2 0 0" mass="{m2}" diaginertia="0.001 0.013333333333 0.013333333333"/>
         <body name="tip" pos="0.4 0 0">
-          <inertial pos="0 0 0" mass="{payload}" diaginertia="1e-9 1e-9 1e-9"/>
+          <inertial pos="0 0 0" mass="{load}" diaginertia="1e-9 1e-9 1e-9"/>
           {hung}
         </body>
       </body>
     </body>
   </worldbody>
   <actuator>
-    <general name="tau1" joint="q1" gear="{gear}" {act1}/>
-    <general name="tau2" joint="q2" {act2}/>
+    <general name="tau1" joint="q1" gear="{gear}" {lag[tau1]}/>
+    <general name="tau2" joint="q2" {lag[tau2]}/>
   </actuator>
 </mujoco>"""
 
@@ -65,97 +67,46 @@ HUNG = """<body name="hung" pos="{at}"><joint name="swing" axis="0 1 0" damping=
 <inertial pos="0 0 {down}" mass="{mass}" diaginertia="1e-4 1e-4 1e-4"/></body>"""
 
 
-def _filter(lag: float) -> str:
-    """Return the XML attributes of an actuator's first-order lag [s]."""
-    return f'dyntype="filterexact" dynprm="{lag}"' if lag else ""
+Part = Mapping[str, Mapping[str, float]]  # {kind: {input or parameter: size}}
+NOTHING: Part = {}
 
 
-def cart_xml(
-    *,
-    timestep: float = 0.01,
-    integrator: str = "RK4",
-    friction: float = 0.0,
-    lag: float = 0.0,
-    armature: float = 0.0,
-    spring: float = 0.0,
-    hung: float = 0.0,
-    true: Mapping[str, float] | None = None,
-) -> str:
-    """Return the cart-pole; `true`: differing M, m, l, b of `grounded.models.cart_pole`."""
-    p = {"M": 1.0, "m": 0.3, "l": 0.5, "b": 0.0} | dict(true or {})
-    return CART.format(
-        timestep=timestep,
-        integrator=integrator,
-        friction=friction,
-        armature=armature,
-        spring=spring,
-        hung=HUNG.format(at=f"0 0 {2 * p['l']}", down=0.15, mass=hung) if hung else "",
-        actuator=_filter(lag),
-        inertia=p["m"] * p["l"] ** 2 / 3,
-        **p,
-    )
+def cart_xml(part: Part = NOTHING, *, hung: float = 0.0, **options: Any) -> str:
+    """Return the cart-pole; `true` in `part`: other M, m, l, b of `grounded.models.cart_pole`."""
+    p = {"M": 1.0, "m": 0.3, "l": 0.5, "b": 0.0} | dict(part.get("true", {}))
+    below = HUNG.format(at=f"0 0 {2 * p['l']}", down=0.15, mass=hung) if hung else ""
+    own = {"timestep": 0.01, "integrator": "RK4", "inertia": p["m"] * p["l"] ** 2 / 3}
+    return _written(CART, part, **own | p | options, hung=below)
 
 
-def arm_xml(
-    *,
-    payload: float = 1e-9,
-    f1: float = 0.0,
-    f2: float = 0.0,
-    armature: float | tuple[float, float] = 0.0,
-    gear: float = 1.0,
-    timestep: float = 0.002,
-    integrator: str = "implicitfast",
-    lag: tuple[float, float] = (0.0, 0.0),
-    spring: float = 0.0,
-    hung: float = 0.0,
-    true: Mapping[str, float] | None = None,
-) -> str:
-    """Return the two-link arm; `true`: differing m2, b1, b2 of `grounded.models.arm`."""
-    a1, a2 = np.broadcast_to(armature, 2)
-    return ARM.format(
-        payload=payload,
-        f1=f1,
-        f2=f2,
-        a1=a1,
-        a2=a2,
-        gear=gear,
-        timestep=timestep,
-        integrator=integrator,
-        act1=_filter(lag[0]),
-        act2=_filter(lag[1]),
-        spring=spring,
-        hung=HUNG.format(at="0 0 0", down=-0.15, mass=hung) if hung else "",
-        **({"m2": 1.0, "b1": 0.0, "b2": 0.0} | dict(true or {})),
-    )
+def arm_xml(part: Part = NOTHING, *, hung: float = 0.0, **options: Any) -> str:
+    """Return the two-link arm; `true`: other m2, b1, b2, load of `grounded.models.arm`."""
+    p = {"m2": 1.0, "b1": 0.0, "b2": 0.0, "load": 0.0} | dict(part.get("true", {}))
+    below = HUNG.format(at="0 0 0", down=-0.15, mass=hung) if hung else ""
+    own = {"timestep": 0.002, "integrator": "implicitfast"}
+    p["load"] = max(p["load"], 1e-9)
+    return _written(ARM, part, **own | p | options, hung=below)
 
 
-def cart_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
-    """Return the cart-pole with the effects of a case, {kind: {input or parameter: size}}."""
-    at = {kind: values.get("force", 0.0) for kind, values in part.items() if kind != "true"}
-    return cart_xml(integrator="implicitfast", true=part["true"], **at, **more)
-
-
-def arm_built(part: Mapping[str, Mapping[str, float]], **more: Any) -> str:
-    """Return the arm with the effects of a case, {kind: {input or parameter: size}}."""
-    two = {k: (v.get("tau1", 0.0), v.get("tau2", 0.0)) for k, v in part.items() if k != "true"}
-    f1, f2 = two["friction"]
-    true = dict(part["true"])
-    load = max(true.pop("load"), 1e-9)
-    return arm_xml(
-        payload=load, f1=f1, f2=f2, armature=two["armature"], lag=two["lag"], true=true, **more
-    )
+def _written(template: str, part: Part, **options: Any) -> str:
+    """Return the XML with what is withheld: friction, armature and lag [s] by input."""
+    kinds = {kind: defaultdict(float, part.get(kind, {})) for kind in ("friction", "armature")}
+    lags = {name: lag for name, lag in part.get("lag", {}).items() if lag}
+    filters = {name: f'dyntype="filterexact" dynprm="{lag}"' for name, lag in lags.items()}
+    given = {"gear": 1.0, "spring": 0.0} | kinds | options
+    return template.format(**given, lag=defaultdict(str, filters))
 
 
 @dataclass(frozen=True, eq=False)
 class Mechanism:
     """A mechanism with what its crude model lacks.
 
-    `built` writes its XML. `part` is {kind: {input: size}} with kinds friction, armature and lag,
-    and the "true" parameters.
+    `built` writes its XML. `part` has the kinds friction, armature and lag by input, and the "true"
+    parameters.
     """
 
     built: Callable[..., str]
-    part: Mapping[str, Mapping[str, float]]
+    part: Part
     more: Mapping[str, float] = field(default_factory=dict)  # spring, hung
 
     def plant(self, fine: float) -> Plant:
@@ -168,7 +119,8 @@ class Plant:
 
     def __init__(self, of: Mechanism, fine: float) -> None:
         self.mj, self.steps = simulator(), int(np.ceil(fine / STEP))
-        xml = of.built(of.part, timestep=fine / self.steps, **of.more)
+        step = fine / self.steps
+        xml = of.built(of.part, timestep=step, integrator="implicitfast", **of.more)
         self.model = self.mj.MjModel.from_xml_string(xml)
         self.data = self.mj.MjData(self.model)
         self.filtered = np.flatnonzero(self.model.actuator_actadr >= 0)  # that have a state

@@ -252,7 +252,7 @@ ARM = SystemUnderTest(
     duration=(4.0, 7.0),
     settled=True,
     bend=0.005,
-    built=mechanism.arm_built,
+    built=mechanism.arm_xml,
 )
 
 
@@ -279,7 +279,7 @@ CART_POLE = SystemUnderTest(
     driven="x_vel",
     duration=(4.0, 8.0),
     bend=0.02,
-    built=mechanism.cart_built,
+    built=mechanism.cart_xml,
 )
 
 

@@ -12,7 +12,7 @@ from cli import grounded
 from facts import holding, holds
 from grounded.challenge import judge, make, of_crude, summary
 from grounded.challenge.draws import draw_withheld, values_of
-from grounded.challenge.mechanism import Mechanism, arm_built, cart_built
+from grounded.challenge.mechanism import Mechanism, arm_xml, cart_xml
 from grounded.challenge.score import Oracle, share
 from grounded.challenge.systems import SYSTEMS
 from grounded.effects import Library, Scales
@@ -261,7 +261,7 @@ def test_a_gyro_shows_a_drift_of_the_heading_from_the_first_sample():
 
 
 @pytest.mark.parametrize(
-    ("system", "built", "motor"), [("arm", arm_built, "tau2"), ("cart_pole", cart_built, "force")]
+    ("system", "built", "motor"), [("arm", arm_xml, "tau2"), ("cart_pole", cart_xml, "force")]
 )
 def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built, motor):
     pytest.importorskip("mujoco")
