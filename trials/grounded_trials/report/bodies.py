@@ -23,7 +23,7 @@ only parameter in m, whatever its name. If the lengths are unknown, links have e
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -44,7 +44,11 @@ NED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])  # to east,
 
 @dataclass(frozen=True)
 class Scene:
-    """The states on the axes of a picture, by index; None or () if a model has no such role."""
+    """The states on the axes of a picture, by index; None or () if a model has no such role.
+
+    It is also the body of a vehicle: a mark along the path, a kite in space, in a phase plane a
+    dot.
+    """
 
     names: tuple[str, ...]  # of the axes, horizontal first
     units: tuple[str, ...]
@@ -53,17 +57,29 @@ class Scene:
     attitude: tuple[int, ...]
     map: bool  # axes are north and east: the heading is measured from north
     spatial: bool  # False: a phase plane
+    size: float = 1.0  # of a kite
+
+    @property
+    def unit(self) -> str:
+        """The unit of the first axis."""
+        return self.units[0]
 
     @property
     def volume(self) -> bool:
         """Whether there is a third axis."""
         return len(self.axes) == 3
 
-    def points(self, states: Array) -> Array:
+    def path(self, states: Array) -> Array:
         """Return positions (T, 3) of states (T, n); the third is 0 if there is no third axis."""
         found = np.zeros((len(states), 3))
         found[:, : len(self.axes)] = states[:, list(self.axes)]
         return found
+
+    def sticks(self, states: Array) -> Array:
+        """Return the kite's edges (T, 5, 2, 3), turned by heading or attitude; none of a dot."""
+        kite = self.size * (KITE if self.spatial else KITE[:0])
+        turned = np.einsum("tij,skj->tski", self.rotations(states), kite)
+        return np.asarray(self.path(states)[:, None, None] + turned)
 
     def rotations(self, states: Array) -> Array:
         """Return body axes (nose, left, up) as the columns of rotation matrices (T, 3, 3)."""
@@ -109,7 +125,7 @@ def body_in(findings: Findings) -> Body:
     """Return the body of a workspace's model, in a size that is visible next to the path."""
     model = findings.task.model
     scene, drawn = scene_of(model), findings.runs or findings.logs
-    points = finite(scene.points(drawn[0].trial.states if drawn else findings.task.target))
+    points = finite(scene.path(drawn[0].trial.states if drawn else findings.task.target))
     size = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     return body_of(model, scene, LENGTH * (size or 1.0))
 
@@ -132,12 +148,12 @@ def body_of(model: Model, scene: Scene, size: float) -> Body:
             unit = "m" if all(lengths) else ""
             drawn = tuple(length or 1.0 for length in lengths)
             return Links(tuple(angles), drawn, zero, sign, unit, tuple(roles.get("rail", [])))
-    return Vehicle(scene, size)
+    return replace(scene, size=size)
 
 
 def is_mechanism(body: Body) -> bool:
     """Return whether a body is drawn from the side; otherwise it is a mark along a path."""
-    return not isinstance(body, Vehicle)
+    return not isinstance(body, Scene)
 
 
 def finite(points: Array) -> Array:
@@ -152,29 +168,6 @@ def _lengths(model: Model, count: int) -> tuple[float, ...]:
     if len(metres) == count == 1:
         shared = next(iter(metres.values()))
     return tuple(metres.get(f"l{i}", shared) for i in range(1, count + 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Vehicle:
-    """A mark along a path: a kite in space, in a phase plane a dot."""
-
-    scene: Scene
-    size: float
-
-    @property
-    def unit(self) -> str:
-        """The unit of the first axis."""
-        return self.scene.units[0]
-
-    def sticks(self, states: Array) -> Array:
-        """Return the kite's edges (T, 5, 2, 3), turned by heading or attitude; none of a dot."""
-        kite = self.size * (KITE if self.scene.spatial else KITE[:0])
-        turned = np.einsum("tij,skj->tski", self.scene.rotations(states), kite)
-        return np.asarray(self.path(states)[:, None, None] + turned)
-
-    def path(self, states: Array) -> Array:
-        """Return the positions (T, 3)."""
-        return self.scene.points(states)
 
 
 @dataclass(frozen=True, eq=False)
