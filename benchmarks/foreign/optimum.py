@@ -24,13 +24,11 @@ from grounded.search.ask_tell import learn
 from grounded.search.first_policy import first_policy
 from grounded.search.step_size import SearchOptions
 from grounded.solve import ddp
-from grounded.task import Task
 from grounded.trial import Trial
 
 FILE = Path(__file__).with_name("optima.json")
 SHIFT = 1e-4  # of the range of an input: the step of the differences
 ROUNDS, GAIN = 25, 5e-5  # at most; least relative gain of one
-STARTS = 20
 LOST = 1e3  # residual of every step after a run has ended early
 
 
@@ -49,45 +47,21 @@ def remember(name: str, utility: float, origin: str) -> None:
 
 def optimum(setup: Setup, say=lambda line: None) -> tuple[float, str]:
     """Return the best utility found with the simulator's own derivatives, and how."""
-    standing = learn(setup.task, setup.run, SearchOptions()).standing
-    best = standing.incumbent
+    best = learn(setup.task, lambda one: setup.run(one.policy), SearchOptions()).standing.incumbent
     starts = {} if best is None else {"the search": best.candidate.policy}
-    first = best.candidate.policy if best is not None else first_policy(setup.task)[0]
     if setup.truth is not None:
-        for start in (first.feedforward, *planned(setup.task)):
-            solved = ddp.solve(
-                setup.truth.problem(), start, options=DescentOptions(max_iterations=40)
-            )
+        for policy in (*[*starts.values()], first_policy(setup.task)[0]):
+            options = DescentOptions(max_iterations=40)
+            solved = ddp.solve(setup.truth.problem(), policy.feedforward, options=options)
             if solved.ok:
                 starts[f"DDP in the simulator ({len(starts)})"] = narrowed(setup, solved)
     found = []
     for origin, policy in starts.items():
-        utility = setup.task.utility(setup.real(policy, 0))
+        utility = setup.task.utility(setup.run(policy))
         _, better = polish(setup, policy)
         say(f"{setup.name}: {origin} {utility:.5g}, polished {better:.5g}")
         found += [(utility, origin), (better, f"{origin}, polished")]
     return max(found)
-
-
-def planned(task: Task) -> list[np.ndarray]:
-    """Return inputs (H, m) of the best two plans in the crude model, from many starts.
-
-    Starts are the first policy, held inputs, and held inputs with smooth random changes. The crude
-    model is compiled, so a solve takes milliseconds.
-    """
-    rng, H = np.random.default_rng(0), task.horizon
-    span = np.where(np.isfinite(task.high - task.low), task.high - task.low, 1.0)
-    starts = [first_policy(task)[0].feedforward, np.tile(task.past, (H, 1))]
-    if task.model.system.how == "compiled":
-        for _ in range(STARTS):
-            knots = rng.uniform(-0.3, 0.3, (6, task.model.m)) * span
-            at, grid = np.linspace(0, 5, H), np.arange(6)
-            moved = np.column_stack([np.interp(at, grid, column) for column in knots.T])
-            starts.append(np.clip(task.past + moved, task.low, task.high))
-    options = DescentOptions(max_iterations=500)
-    solved = [ddp.solve(task.problem(), start, options=options) for start in starts]
-    good = sorted((s for s in solved if np.isfinite(s.cost)), key=lambda s: s.cost)
-    return [s.u for s in good[:2]]
 
 
 def narrowed(setup: Setup, solved: ddp.Result) -> Policy:
@@ -110,13 +84,13 @@ def polish(setup: Setup, policy: Policy) -> tuple[Policy, float]:
 
     found = least_squares(missed, np.ones(first.size), diff_step=SHIFT, ftol=GAIN, max_nfev=ROUNDS)
     better = replace(policy, feedforward=sent(found.x))
-    utilities = [task.utility(setup.real(one, 0)) for one in (policy, better)]
+    utilities = [task.utility(setup.run(one)) for one in (policy, better)]
     return (better if utilities[1] > utilities[0] else policy), max(utilities)
 
 
 def residual(setup: Setup, policy: Policy, v: np.ndarray) -> np.ndarray:
     """Return the square roots of a run's penalties: utility = -|residual|^2."""
-    trial: Trial = setup.real(replace(policy, feedforward=v), 0)
+    trial: Trial = setup.run(replace(policy, feedforward=v))
     task, reward, T = setup.task, setup.task.reward, trial.steps
     error = np.nan_to_num(task.model.difference(trial.states, task.target[: T + 1]))
     weight = np.tile(reward.state, (T + 1, 1))

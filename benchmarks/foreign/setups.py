@@ -13,7 +13,6 @@ from benchmarks.foreign.robots import Robot, with_true_model
 from grounded.adapters import mujoco
 from grounded.challenge.mechanism import arm_xml, cart_xml
 from grounded.policy import Policy
-from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial
 
@@ -33,12 +32,8 @@ class Setup:
     truth: Task | None = None
     cause: str = ""
 
-    def run(self, candidate: Candidate) -> Trial:
-        """Run the candidate once on the robot."""
-        return self.robot.run(candidate.policy)
-
-    def real(self, policy: Policy, run: int) -> Trial:
-        """Run a policy on the robot; every run is the same."""
+    def run(self, policy: Policy) -> Trial:
+        """Run a policy on the robot; every run is the same, but for its noise."""
         return self.robot.run(policy)
 
 

@@ -18,7 +18,6 @@ from benchmarks.foreign.setups import Setup
 from benchmarks.helpers import table
 from grounded.diagnosis.diagnose import diagnose
 from grounded.diagnosis.parts import Diagnosis
-from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.search.improve import propose
 from grounded.search.planner import Planner
@@ -79,7 +78,7 @@ def measured(setup: Setup, after: int = 0) -> Row:
             if made is None:
                 break
             candidates += [made] * proposal.is_new
-            trials.append(replace(setup.run(made), candidate=made.id, id=f"t{len(trials)}"))
+            trials.append(replace(setup.run(made.policy), candidate=made.id, id=f"t{len(trials)}"))
     except Exception as error:
         ended = f"{type(error).__name__}: {error}"
     utilities = [task.utility(trial) for trial in trials]
@@ -119,18 +118,15 @@ def trials_to(setup: Setup, utilities: list[float], best: float | None) -> tuple
     if best is None or not utilities:
         return (None,) * len(SHARES)
     base = utilities[0]
-    if not np.isfinite(base):
-        base = setup.task.utility(setup.real(held(setup), 0))
+    if not np.isfinite(base):  # the inputs from before the start, held
+        task = setup.task
+        held = task.policy(np.tile(task.past, (task.horizon, 1)), None, None)
+        base = setup.task.utility(setup.run(held))
     so_far = np.maximum.accumulate(utilities)
     levels = [min(best - (1 - share) * (best - base), best - CLOSE * abs(best)) for share in SHARES]
     return tuple(
         int(np.argmax(so_far >= level)) + 1 if (so_far >= level).any() else None for level in levels
     )
-
-
-def held(setup: Setup) -> Policy:
-    """Return a policy that holds the inputs from before the start."""
-    return setup.task.policy(np.tile(setup.task.past, (setup.task.horizon, 1)), None, None)
 
 
 def results(rows: list[Row]) -> str:

@@ -1,17 +1,9 @@
 """Effects of a vehicle's motion over the ground: drift, slip, understeer, slope, patches.
 
-With the position (x, y), the heading psi and the speed v of the model's roles:
-
-    drift_world   x' += a,                     y' += b                     wind, a conveyor
-    drift_body    x' += a cos psi - b sin psi, y' += a sin psi + b cos psi carpet, misaligned wheels
-    side_slip     the velocity sideways is -k v^2 psi'  (k times the lateral acceleration, times v)
-    understeer    psi' = model / (1 + k v^2)
-    grip_limit    |v psi'| <= a                                            tyres that let go
-    cornering_drag   v' = model - k |delta| v                              turned wheels brake
-    lever_arm     the point whose position is logged lies a ahead, b to the left of the model's:
-                  its velocity has b psi' less ahead, a psi' more to the left
-    slope         v' += a cos psi + b sin psi                              a floor that tilts
-    patch         s' += c exp(-|q - q0|^2 / (2 radius^2)) at a place q0    a doormat, a puddle
+Equations are in terms of the position (x, y), the heading psi and the speed v of the model's roles.
+A drift over the ground is a wind or a conveyor, one with the heading a carpet or misaligned wheels;
+a side slip is k times the lateral acceleration, times v; a lever arm is how far ahead (a) and to
+the left (b) of the model's point the logged one lies; a patch is a doormat, a puddle.
 """
 
 from __future__ import annotations

@@ -18,7 +18,7 @@ PALETTE = COLOURS | {  # every role's colour on white and on black
     "paper": ("#ffffff", "#16181b"),
 }
 LETTER = 0.008  # width of a letter of a bar's label, as a share of a figure
-SPACE = 100  # between rows [px]
+HEIGHT, SPACE = 200, 100  # of a row, and between rows [px]
 
 
 def coloured(value: Any, dark: bool = False) -> Any:
@@ -40,12 +40,8 @@ def packed(array: Array) -> dict[str, str]:
     return {"dtype": "f4", "bdata": base64.b64encode(values.tobytes()).decode()}
 
 
-def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
+def notebook_figure(figures: Sequence[Figure]) -> Any:
     """Return all panels of some figures as one Plotly figure, two side by side.
-
-    Args:
-        figures: the figures.
-        height: height of a row of panels [px].
 
     Raises:
         GroundedError: if Plotly is not installed.
@@ -58,7 +54,7 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     columns, rows = min(2, len(panels)), -(-len(panels) // 2)
     if not panels:
         return Drawn()
-    heights = [max(_tall(height, one) for one in panels[2 * k : 2 * k + 2]) for k in range(rows)]
+    heights = [max(_tall(one) for one in panels[2 * k : 2 * k + 2]) for k in range(rows)]
     titles = [f"{p.title}<br><sub>{p.note}</sub>" if p.note else p.title for p in panels]
     labels = [text for p in panels[1::2] for text in p.layout["yaxis"].get("ticktext", ())]
     longest = max((len(part) for text in labels for part in text.split("<br>")), default=0)
@@ -99,8 +95,8 @@ def notebook_figure(figures: Sequence[Figure], height: int = 300) -> Any:
     return made
 
 
-def _tall(height: int, panel: Panel) -> int:
+def _tall(panel: Panel) -> int:
     """Return the height of a panel's plot [px]."""
     if panel.kind != "bars":
-        return height - SPACE
+        return HEIGHT
     return max((4 + 15 * label_lines(panel)) * len(panel.data[0]["y"]), 60)
