@@ -23,7 +23,9 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.helpers import table
 from grounded import Model, Param, Reward, Search, Task
+from grounded.compile import Named
 from grounded.frozen import Array
 from grounded.onboard import Runner
 from grounded.search.candidate import Candidate
@@ -298,15 +300,13 @@ def by_hand(real: Real, H: int, rng: np.random.Generator, **named: Any) -> Trial
 def _step(robot: Robot, x: Array, a: Array, values: Array, size: float, dt: float) -> Array:
     after = robot.model.system.step(x[None], a[None], values, dt)[0]
     if size:
-        s = _Named(robot.model.state_names, x)
-        for name, rate in robot.lacks(s, _Named(robot.model.input_names, a), size).items():
+        s, sent = (
+            Named("state", robot.model.state_names, x),
+            Named("input", robot.model.input_names, a),
+        )
+        for name, rate in robot.lacks(s, sent, size).items():
             after[robot.model.state_names.index(name)] += dt * rate
     return np.asarray(after)
-
-
-class _Named:
-    def __init__(self, names: Sequence[str], values: Array) -> None:
-        self.__dict__.update(zip(names, values, strict=True))
 
 
 def _excited(robot: Robot, rng: np.random.Generator, H: int) -> Array:
@@ -347,6 +347,11 @@ def _set(trials: Sequence[Trial], change: Callable[[dict[str, Array]], None]) ->
     return found
 
 
+def _times(trials: Sequence[Trial], names: Sequence[str], by: float) -> list[Trial]:
+    """Return the trials with some columns multiplied."""
+    return _set(trials, lambda c: c.update({n: by * c[n] for n in names}))
+
+
 def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Iterator[Fault]:
     """Yield the faults that a robot's log can have; which signal has it is drawn."""
     model, dt = robot.model, robot.dt
@@ -355,9 +360,6 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
     def some_of(*wanted: str, draw: bool = False) -> list[str]:
         names = [n for n in model.states if units[n] in wanted]
         return [str(rng.choice(names))] if draw and names else names
-
-    def times(names: Sequence[str], by: float) -> list[Trial]:
-        return _set(trials, lambda c: c.update({n: by * c[n] for n in names}))
 
     def shifted(names: Sequence[str], steps: float) -> list[Trial]:
         def moved(x: Array) -> Array:
@@ -404,14 +406,16 @@ def faults(robot: Robot, trials: list[Trial], rng: np.random.Generator) -> Itera
         ("commands: unit", same, factors[units[b]]),
     ):
         if names:
-            yield fault(name, "sign" if by == -1.0 else "unit", names, times(names, by))
-    yield fault("degrees once", "unit", angle, [*times(angle, DEGREES)[:1], *trials[1:]])
+            yield fault(name, "sign" if by == -1.0 else "unit", names, _times(trials, names, by))
+    yield fault("degrees once", "unit", angle, [*_times(trials, angle, DEGREES)[:1], *trials[1:]])
     if not robot.held:
-        yield fault("reversed once", "sign", [b], [*times([b], -1.0)[:1], *trials[1:]])
+        yield fault("reversed once", "sign", [b], [*_times(trials, [b], -1.0)[:1], *trials[1:]])
     # a rate
     if rate:
         (r,), noise = rate, max(robot.noise)
-        yield fault("rate: scale", "scale", rate, times(rate, float(rng.choice([0.75, 1.3]))))
+        yield fault(
+            "rate: scale", "scale", rate, _times(trials, rate, float(rng.choice([0.75, 1.3])))
+        )
         dead = _set(trials, lambda c: c.update({r: noise * rng.normal(size=len(c[r]))}))
         yield fault("rate: noise", "dead", rate, dead)
         none = _set(trials, lambda c: c.update({r: np.full(len(c[r]), 0.0)}))
@@ -492,9 +496,6 @@ def conditions(
         lengths: its positions.
     """
 
-    def times(names: Sequence[str], by: float, some: Sequence[Trial]) -> list[Trial]:
-        return _set(some, lambda c: c.update({n: by * c[n] for n in names}))
-
     def shaken(trial: Trial, size: float) -> Trial:
         noise = size * np.array(robot.noise) * rng.normal(size=trial.states.shape)
         return replace(trial, states=trial.states + noise)
@@ -521,7 +522,7 @@ def conditions(
     ):
         rest_of = others if name.startswith("one of six") else []
         if names:
-            changed = [*times(names, by, some), *rest_of]
+            changed = [*_times(some, names, by), *rest_of]
             yield Fault(name, kind, (frozenset(names),), changed)
 
 
@@ -668,8 +669,13 @@ def verdict(fault: Fault, found: Sequence[tuple[str, frozenset[str]]]) -> str:
     return "wrong" if found else "silent"
 
 
+MARKS = ("right", "part", "silent", "wrong")
+RUNS = ("taken", "named", "refused", "another")
+Counts = defaultdict[str, Counter[str]]
+
+
 def main() -> None:
-    """Print the matrix."""
+    """Print the matrix of faults, the honest runs, and the runs of candidates."""
     parser = argparse.ArgumentParser()
     parser.add_argument("--seeds", default="0,2,4")
     parser.add_argument("--robots", default=",".join(ROBOTS))
@@ -679,71 +685,61 @@ def main() -> None:
     parser.add_argument("--by-hand", type=int, default=32, help="runs by hand, in all")
     parser.add_argument("--all", action="store_true")
     args = parser.parse_args()
-    seeds, began = [int(s) for s in args.seeds.split(",")], time.process_time()
-    table, names = defaultdict[str, Counter[str]](Counter), defaultdict[str, Counter[str]](Counter)
-    cases = 0
-    for which in args.robots.split(","):
-        robot = ROBOTS[which]()
-        for seed in seeds:
-            rng = np.random.default_rng([seed, [*ROBOTS].index(which)])
-            for fault in faults(robot, driven(robot, rng), rng):
-                if args.faults and fault.name not in args.faults.split(","):
-                    continue
-                found, refused = named(robot.model, fault.trials)
-                kind, cases = verdict(fault, found), cases + 1
-                table[fault.name][kind] += 1
-                for one, _ in found or [("-", frozenset())]:
-                    names[fault.name][one] += 1
-                if args.all:
-                    told = "; ".join(f"{k} {'+'.join(sorted(s))}" for k, s in found)
-                    print(
-                        f"{kind:7}{which:6}{seed:3} {fault.name:32} {'refused' * refused:8}{told}",
-                        flush=True,
-                    )
-    print(f"\n{'true fault':34}{'right':>6}{'part':>6}{'silent':>7}{'wrong':>6}   named")
-    total = Counter[str]()
-    for name, row in table.items():
-        total += row
-        said = ", ".join(f"{k} {n}" for k, n in names[name].most_common(4))
-        print(f"{name:34}{row['right']:6}{row['part']:6}{row['silent']:7}{row['wrong']:6}   {said}")
-    every = sum(total.values())
-    print(
-        f"{'all':34}{total['right']:6}{total['part']:6}{total['silent']:7}{total['wrong']:6}   "
-        f"{100 * total['right'] / max(every, 1):.1f} % right"
-    )
-    used = time.process_time() - began
-    print(f"{cases} cases, {used / max(cases, 1):.2f} s CPU each")
-    refusals = told = logs = 0
-    for which in args.robots.split(",") if args.honest else ():
-        robot = ROBOTS[which]()
-        for k in range(args.honest):
-            rng = np.random.default_rng([seeds[0], 77, k, [*ROBOTS].index(which)])
-            found, refused = named(robot.model, driven(robot, rng, 1 + k % 3))
-            logs, refusals, told = logs + 1, refusals + refused, told + bool(found)
-            if found and args.all:
-                print("honest", which, k, "refused" * refused, found, flush=True)
-    print(f"honest: {refusals} of {logs} refused, a story told of {told}")
-    _candidates(args, seeds)
+    seeds, robots = [int(s) for s in args.seeds.split(",")], args.robots.split(",")
+    each, said = [(which, seed) for which in robots for seed in seeds], print if args.all else _no
 
+    # every fault, as it was named
+    counts, names, began = Counts(Counter), Counts(Counter), time.process_time()
+    for which, seed in each:
+        robot, rng = ROBOTS[which](), np.random.default_rng([seed, [*ROBOTS].index(which)])
+        for fault in faults(robot, driven(robot, rng), rng):
+            if args.faults and fault.name not in args.faults.split(","):
+                continue
+            found, refused = named(robot.model, fault.trials)
+            kind = verdict(fault, found)
+            counts[fault.name][kind] += 1
+            names[fault.name].update([one for one, _ in found] or ["-"])
+            told = "; ".join(f"{k} {'+'.join(sorted(s))}" for k, s in found)
+            said(f"{kind:7}{which:6}{seed:3} {fault.name:32} {'refused' * refused:8}{told}")
+    total = sum(counts.values(), Counter[str]())
+    rows = [
+        (name, *(row[mark] for mark in MARKS), ", ".join(f"{k} {n}" for k, n in top))
+        for name, row in counts.items()
+        for top in [names[name].most_common(4)]
+    ]
+    cases = max(sum(total.values()), 1)
+    share = f"{100 * total['right'] / cases:.1f} % right"
+    rows.append(("all", *(total[mark] for mark in MARKS), share))
+    print(table(("true fault", *MARKS, "named"), rows))
+    print(f"{cases} cases, {(time.process_time() - began) / cases:.2f} s CPU each")
 
-def _candidates(args: argparse.Namespace, seeds: Sequence[int]) -> None:
-    """Print what is told of runs that are said to be a candidate's."""
-    each = [(which, seed) for seed in seeds for which in args.robots.split(",")]
-    table, began = defaultdict[str, Counter[str]](Counter), time.process_time()
-    if not (args.wrong or args.by_hand):
-        return
-    for k, (which, seed) in enumerate(each):
+    # honest runs, of which nothing is to be told
+    refusals = stories = logs = 0
+    for which, k in ((which, k) for which in robots for k in range(args.honest)):
+        robot = ROBOTS[which]()
+        rng = np.random.default_rng([seeds[0], 77, k, [*ROBOTS].index(which)])
+        found, refused = named(robot.model, driven(robot, rng, 1 + k % 3))
+        logs, refusals, stories = logs + 1, refusals + refused, stories + bool(found)
+        if found:
+            said("honest", which, k, "refused" * refused, found)
+    print(f"honest: {refusals} of {logs} refused, a story told of {stories}")
+
+    # runs that are said to be a candidate's
+    ran, pairs = Counts(Counter), [(which, seed) for seed in seeds for which in robots]
+    for k, (which, seed) in enumerate(pairs if args.wrong or args.by_hand else ()):
         rng = np.random.default_rng([seed, 55, [*ROBOTS].index(which)])
-        shares = (n // len(each) + (k < n % len(each)) for n in (args.wrong, args.by_hand))
+        shares = (n // len(pairs) + (k < n % len(pairs)) for n in (args.wrong, args.by_hand))
         for kind, told in runs(ROBOTS[which](), rng, *shares):
-            table[kind][told] += 1
-            if args.all:
-                print(f"{told:8}{which:6}{seed:3} {kind}", flush=True)
-    columns = ("taken", "named", "refused", "another")
-    print(f"\n{'run':34}" + "".join(f"{name:>9}" for name in columns))
-    for kind, row in sorted(table.items()):
-        print(f"{kind:34}" + "".join(f"{row[name]:9}" for name in columns))
-    print(f"{time.process_time() - began:.0f} s CPU")
+            ran[kind][told] += 1
+            said(f"{told:8}{which:6}{seed:3} {kind}")
+    if ran:
+        print(
+            table(("run", *RUNS), [(k, *(row[n] for n in RUNS)) for k, row in sorted(ran.items())])
+        )
+
+
+def _no(*words: object) -> None:
+    """Print nothing."""
 
 
 if __name__ == "__main__":
