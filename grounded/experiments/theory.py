@@ -37,6 +37,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from grounded.compile import Problem
 from grounded.engine import Engine
@@ -56,7 +57,7 @@ from grounded.utility import Reward
 EPSILONS = (0.003, 0.01, 0.03, 0.1, 0.3)
 H, DT = 40, 0.1
 ITERATIONS = 3000
-GOLDEN = (math.sqrt(5) - 1) / 2
+CLOSE = 1e-8  # relative tolerance of a line search
 
 
 @dataclass(frozen=True)
@@ -214,13 +215,10 @@ def _line_search(real: Problem, u: Array, direction: Array, cost: float) -> Arra
     best = int(np.argmin(found))
     if not found[best] < cost:
         return None
-    low, high = alphas[best] / 2, alphas[best] * 2
-    for _ in range(40):
-        a, b = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-        ca, cb = costs(np.array([a, b]))
-        low, high = (low, b) if ca < cb else (a, high)
-    last = np.array([alphas[best], 0.5 * (low + high)])
-    return u + float(last[np.argmin(costs(last))]) * direction
+    ends, near = (alphas[best] / 2, alphas[best] * 2), {"xatol": CLOSE * alphas[best]}
+    inside = minimize_scalar(lambda a: costs(np.array([a]))[0], bounds=ends, options=near)
+    alpha = inside.x if inside.fun < found[best] else alphas[best]
+    return u + float(alpha) * direction
 
 
 OFFSETS = (1.0, 2.0, 3.0, 5.0, 10.0, 30.0)

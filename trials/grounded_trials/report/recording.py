@@ -122,6 +122,11 @@ class _Recorder:
         """Record what holds at all times."""
         self.stream.log(at, look, static=True)
 
+    def send(self, at: str, look: Any, times: Any, columns: Any) -> None:
+        """Record columns of values at some times [s], and their look once."""
+        self.log(at, look)
+        self.stream.send_columns(at, [rr.TimeColumn("time", duration=times)], columns)
+
     def everything(self) -> None:
         findings = self.findings
         self.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
@@ -133,7 +138,7 @@ class _Recorder:
         for run in findings.runs:
             at = f"trials/{run.trial.id}"
             self.trial(at, run.trial, run.residual, self.colour(run))
-            self.ghost(f"{at}/predicted", run)
+            self.moving(f"{at}/predicted", run.candidate.predicted_states, "predicted")
             if run.explained is not None:
                 self.rates(f"{at}/explained", run.explained)
         for one in findings.logs:
@@ -150,7 +155,7 @@ class _Recorder:
         if first is not None:
             self.moving("paths/model_policy", first.trial.states, "model")
         if best is not None and (first is None or best.candidate is not first.candidate):
-            self.ghost("paths/predicted", best)
+            self.moving("paths/predicted", best.candidate.predicted_states, "predicted")
             self.moving("paths/best", best.trial.states, "best")
 
     def series(self, figure: Figure) -> None:
@@ -191,10 +196,6 @@ class _Recorder:
         units = {name: per_second(unit) for name, unit in self.task.model.states.items()}
         self.columns(at, averaged(residual, step) / self.dt, step * self.dt, units)
 
-    def ghost(self, at: str, run: Run) -> None:
-        """Record the predicted run, with a body that moves alongside the real one."""
-        self.moving(at, run.candidate.predicted_states, "predicted")
-
     def moving(self, at: str, states: Array, colour: str, path: str = "") -> None:
         """Record the path of states, and the body that moves and turns along it."""
         self.path(at + path, states, colour)
@@ -202,15 +203,16 @@ class _Recorder:
         rows = rows[:: max(1, len(rows) // FRAMES)]
         if not len(rows):
             return
-        sticks, look = self.body.sticks(states[rows]), dict[str, Any](colors=COLOURS[colour])
-        columns = rr.LineStrips3D.columns(strips=[*sticks.reshape(-1, 2, 3)])
-        columns = columns.partition([sticks.shape[1]] * len(rows))
-        self.log(f"{at}/body", rr.LineStrips3D.from_fields(**look, radii=rr.Radius.ui_points(2)))
-        if not sticks.size:
+        sticks, radius = self.body.sticks(states[rows]), rr.Radius.ui_points
+        look: Any = None
+        if sticks.size:
+            look = rr.LineStrips3D.from_fields(colors=COLOURS[colour], radii=radius(2))
+            columns = rr.LineStrips3D.columns(strips=[*sticks.reshape(-1, 2, 3)])
+            columns = columns.partition([sticks.shape[1]] * len(rows))
+        else:
+            look = rr.Points3D.from_fields(colors=COLOURS[colour], radii=radius(6))
             columns = rr.Points3D.columns(positions=self.body.path(states[rows]))
-            self.log(f"{at}/body", rr.Points3D.from_fields(**look, radii=rr.Radius.ui_points(6)))
-        times = [rr.TimeColumn("time", duration=rows * self.dt)]
-        self.stream.send_columns(f"{at}/body", times, columns)
+        self.send(f"{at}/body", look, rows * self.dt, columns)
 
     def path(self, at: str, states: Array, colour: str) -> None:
         """Record a path in space as one static line."""
@@ -223,28 +225,28 @@ class _Recorder:
         self, at: str, times: Array, values: Array, role: str, name: str, width: float = 1.0
     ) -> None:
         """Record the finite values of a curve over time."""
-        self.log(at, rr.SeriesLines(colors=COLOURS[role], names=name, widths=width))
-        keep = np.flatnonzero(np.isfinite(values))
-        when = [rr.TimeColumn("time", duration=times[keep])]
-        self.stream.send_columns(at, when, rr.Scalars.columns(scalars=values[keep]))
+        look, keep = (
+            rr.SeriesLines(colors=COLOURS[role], names=name, widths=width),
+            np.isfinite(values),
+        )
+        self.send(at, look, times[keep], rr.Scalars.columns(scalars=values[keep]))
 
     def marks(self, at: str, trace: Mapping[str, Any], role: str) -> None:
         """Record the marks of a figure as crosses with a note."""
-        look: Any = {"colors": COLOURS[role], "markers": "cross", "marker_sizes": 5.0}
-        self.log(at, rr.SeriesPoints(names=trace["text"][0], **look))
-        when = [rr.TimeColumn("time", duration=trace["x"])]
-        self.stream.send_columns(at, when, rr.Scalars.columns(scalars=trace["y"]))
+        look = rr.SeriesPoints(
+            names=trace["text"][0], colors=COLOURS[role], markers="cross", marker_sizes=5.0
+        )
+        self.send(at, look, trace["x"], rr.Scalars.columns(scalars=trace["y"]))
 
     def columns(self, at: str, values: Array, dt: float, units: Mapping[str, str]) -> None:
         """Record the columns of an array as one entity; `units` by the names of the columns."""
         steps, width = values.shape
         names = [typeset(labelled(name, unit)) for name, unit in units.items()]
         colours = [SERIES[i % len(SERIES)] for i in range(width)]
-        self.log(at, rr.SeriesLines(colors=colours, names=names))
         scalars = rr.Scalars.columns(scalars=np.ascontiguousarray(values).reshape(-1))
         middle = 0.5 * (dt - self.dt)  # of means over several steps
-        times = [rr.TimeColumn("time", duration=np.arange(steps) * dt + middle)]
-        self.stream.send_columns(at, times, scalars.partition([width] * steps))
+        look, times = rr.SeriesLines(colors=colours, names=names), np.arange(steps) * dt + middle
+        self.send(at, look, times, scalars.partition([width] * steps))
 
 
 # the views of the viewer
