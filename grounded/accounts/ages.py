@@ -38,7 +38,6 @@ from grounded.accounts.levels import (
     SURELY,
 )
 from grounded.accounts.signals import quantum
-from grounded.accounts.table import RPM
 from grounded.findings import Quantity
 from grounded.findings import found as found_
 from grounded.frozen import Array, white_noise, wrapped
@@ -46,6 +45,7 @@ from grounded.model import Model
 from grounded.places import Integral, integrals, partner, true_values
 from grounded.result import PREFIX_BELOW
 from grounded.trial import Trial
+from grounded.units import RPM
 
 LEAST_STEPS = 0.1  # of a time step: smaller delays may come from the time stamps
 OFF = 0.03  # scale error that is reported, beyond both of its bounds

@@ -23,11 +23,12 @@ from grounded.accounts.motion import (
     Fit,
     known_states,
 )
-from grounded.accounts.table import RPM, Account, Term, Told, accounts
+from grounded.accounts.table import Account, Term, Told, accounts
 from grounded.frozen import Array, white_noise
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
+from grounded.units import RPM
 
 OF_A_UNIT = 0.015  # tolerance of its ratio
 JUDGED_S = 0.5  # [s] of predictions

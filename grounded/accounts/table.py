@@ -20,27 +20,22 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
+from grounded.units import DEGREES, RPM, factor_between
 
-DEGREES = 180 / np.pi  # in a radian
-RPM = 30 / np.pi  # revolutions a minute in one rad/s
 # a unit: other units that may stand in its place, and how many of them it has
 UNITS: dict[str, dict[str, float]] = {
-    "rad": {"deg": DEGREES},
-    "deg": {"rad": 1 / DEGREES},
-    "rad/s": {"deg/s": DEGREES, "rpm": RPM},
-    "deg/s": {"rad/s": 1 / DEGREES},
-    "rpm": {"rad/s": 1 / RPM, "1/s": 1 / 60},
-    "m": {"mm": 1e3, "cm": 1e2, "km": 1e-3, "feet": 3.28084},
-    "m/s": {
-        "mm/s": 1e3,
-        "cm/s": 1e2,
-        "km/h": 3.6,
-        "knots": 1.943844,
-        "mph": 2.236936,
-        "ft/s": 3.28084,
-    },
-    "%": {"parts of 1": 0.01},
+    unit: {other: factor_between(unit, other) or 1.0 for other in others}
+    for unit, others in {
+        "rad": ("deg",),
+        "deg": ("rad",),
+        "rad/s": ("deg/s", "rpm"),
+        "deg/s": ("rad/s",),
+        "rpm": ("rad/s",),
+        "m": ("mm", "cm", "km", "feet"),
+        "m/s": ("mm/s", "cm/s", "km/h", "knots", "mph", "ft/s"),
+    }.items()
 }
+UNITS["rpm"]["1/s"], UNITS["%"] = 1 / 60, {"parts of 1": 0.01}
 FULL = {"percent": 100.0, "counts of 8 bits": 255.0, "thousandths": 1000.0}  # full scale of a part
 WORDS = {"deg": "degrees", "deg/s": "degrees a second", "rad": "radians"}
 OVER = 1.03  # share of full scale that the largest command of a log stays below
@@ -151,7 +146,7 @@ class Told:
         return self.account.certain
 
 
-ANGULAR = {DEGREES, 1 / DEGREES, RPM}
+ANGULAR = {DEGREES, UNITS["deg"]["rad"], RPM}
 
 
 def units_of(unit: str, most: float = 0.0) -> dict[str, float]:

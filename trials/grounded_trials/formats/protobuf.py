@@ -21,7 +21,6 @@ from grounded_trials.formats.mcap_records import Schema, windows
 
 VARINT, FIXED64, BYTES = 0, 1, 2  # what follows a tag
 DOUBLE, OPTIONAL, REPEATED = 1, 1, 3  # in google/protobuf/descriptor.proto
-NO_NUMBER = 9, 10, 11, 12  # there: texts and messages
 
 
 def varint(value: int) -> bytes:
@@ -139,11 +138,16 @@ def numbers_in(schema: Schema) -> dict[str, tuple[int, bool]]:
     if written == schema.data and schema.name.startswith("grounded."):
         return {name: (i, repeated) for i, name in enumerate(names, start=1)}
     from google.protobuf.descriptor_pb2 import DescriptorProto
+    from google.protobuf.descriptor_pb2 import FieldDescriptorProto as Field
 
+    texts = Field.TYPE_STRING, Field.TYPE_BYTES, Field.TYPE_MESSAGE, Field.TYPE_GROUP
     described = DescriptorProto()
     message_class(schema.data, schema.name).DESCRIPTOR.CopyToProto(described)
-    doubles = [one for one in described.field if one.type not in NO_NUMBER]
-    return {unspelled(one.name): (one.number, one.label == REPEATED) for one in doubles}
+    return {
+        unspelled(one.name): (one.number, one.label == Field.LABEL_REPEATED)
+        for one in described.field
+        if one.type not in texts
+    }
 
 
 @lru_cache(maxsize=256)

@@ -21,6 +21,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import found
+from grounded.units import factor_between
 from grounded_trials.formats.mcap_records import About, Channel, End, Header, Record, Rows, Schema
 from grounded_trials.formats.messages import Floats
 
@@ -39,7 +40,6 @@ ABROAD = (  # the same in other languages, used if no column has an English name
     *("zeit", "zeitstempel", "uhrzeit", "temps", "horodatage", "heure", "tiempo", "hora"),
     *("tempo", "ora", "tijd", "tid", "czas", "aika", "время", "时间", "時間", "时间戳"),
 )
-UNITS = {"ns": 1, "us": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 LATEST = 4e18  # [ns], the year 2096
 
 Columns = Mapping[str, Floats]
@@ -204,9 +204,10 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
         unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
     if lost := len(values) - len(finite):
         raise GroundedError(found("file.times", str(path), name=name, lost=lost))
-    if top * UNITS[unit] > LATEST:
+    nanoseconds = round(1e9 * (factor_between(unit, "s") or 1.0))
+    if top * nanoseconds > LATEST:
         raise GroundedError(found("file.times", str(path), name=name, text=f"{top:g} {unit}"))
-    return name, np.rint(values * UNITS[unit]).astype(np.int64)
+    return name, np.rint(values * nanoseconds).astype(np.int64)
 
 
 def _time_of(names: Sequence[str], path: Path) -> str:

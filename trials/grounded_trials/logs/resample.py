@@ -272,9 +272,9 @@ def begins_early(samples: Samples, grid: Ints) -> float:
     f by what the course changes in min(c (1 - f), f (1 - c)) h, at most f (1 - f) h. This is the
     root mean square of that bound over the grid, divided by sqrt(2) since bends are anywhere.
     """
-    i = np.clip(np.searchsorted(samples.t, grid, "right"), 1, len(samples.t) - 1)
-    h = (samples.t[i] - samples.t[i - 1]) * 1e-9
-    f = np.clip((grid - samples.t[i - 1]) * 1e-9 / h, 0.0, 1.0)
+    i, j = samples.around(grid)
+    h = (samples.t[j] - samples.t[i]) * 1e-9
+    f = np.clip((grid - samples.t[i]) * 1e-9 / h, 0.0, 1.0)
     return float(np.sqrt(np.mean((f * (1 - f) * h) ** 2) / 2))
 
 

@@ -25,9 +25,8 @@ BEFORE_S, FEWEST = 1.0, 8  # [s] before a time from which samples tell the value
 QUANTUM = 2e-3  # of a signal's range: the least noise of its samples
 STRAIGHT = 1.5  # largest scatter about a line, by a sample's noise
 SURE = 3.0  # standard deviations from which a motion, or another value, is no noise
-JUMP_S = 1.0  # a larger jump back means that the clock was set or a simulation restarted
 NEAR_0_S = 10.0  # if other stamps come nearer to 0 than this, a stamp of 0 is valid
-MIXED_S = 1.0  # signals whose clocks differ by more than this are refused
+MIXED_S = 1.0  # clocks that differ or jump back by more than this are refused
 SPARSE = 50.0  # steps between two samples above which the log's time seems to be in another unit
 MOSTLY, WHOLE = (0.01, 0.99), 1.02  # the values of a wrapped angle are so nearly within a turn
 DISORDERED = 0.01  # least share of stamps out of order that counts: sorting mends them
@@ -70,6 +69,11 @@ class Samples:
         sensor = 0 < self.spec.delay_s <= MIXED_S  # other values of delay_s bridge two clocks
         return int(self.t[0]) + round(self.spec.delay_s * 1e9) * sensor
 
+    def around(self, at: Ints) -> tuple[Ints, Ints]:
+        """Return the indices (M,) of the samples before and after times [ns]; at an end, of two."""
+        after = np.clip(np.searchsorted(self.t, at, "right"), 1, len(self.t) - 1)
+        return after - 1, after
+
     def within(self, first: int, last: int) -> tuple[Ints, Floats]:
         """Return the stamps [ns] and the values from `first` to `last` [ns]."""
         inside = (self.t >= first) & (self.t <= last)
@@ -109,11 +113,10 @@ class Samples:
         Raises:
             GroundedError: if a time is in a gap, or outside the samples.
         """
-        i = np.clip(np.searchsorted(self.t, at, "right"), 1, len(self.t) - 1)
-        t0, t1 = self.t[i - 1], self.t[i]
+        i, j = self.around(at)
+        t0, t1 = self.t[i], self.t[j]
         self._refuse_gaps(at, t0, t1, dt, origin)
-        fraction = (at - t0) / (t1 - t0)
-        return self.y[i - 1] + fraction * (self.y[i] - self.y[i - 1])
+        return self.y[i] + (at - t0) / (t1 - t0) * (self.y[j] - self.y[i])
 
     def hold(self, at: Ints, dt: float, origin: int) -> Floats:
         """Return the value of the last sample before each time (zero-order hold).
@@ -268,7 +271,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
         raise _unusable(name, spec, "nothing", len(t))
     t, y = t[good], spec.scale * series.values[good] + spec.offset
     back = np.diff(t)
-    if len(back) and back.min() < -JUMP_S * 1e9:
+    if len(back) and back.min() < -MIXED_S * 1e9:
         k = int(np.argmin(back))
         by = float(-back[k]) * 1e-9
         raise GroundedError(found("file.clocks", name, by=by, sample=str(k)))

@@ -61,6 +61,11 @@ def report_of(
         i = int(np.flatnonzero(inside)[np.argmax(gaps[inside])])
         widest, place = float(gaps[i]), float((t[i] - origin) * 1e-9)
     low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
+    bridged = 0
+    if len(t) > 1:
+        i, j = samples.around(at)
+        wide = (t[j] - t[i]) * 1e-9 > BRIDGED * samples.interval
+        bridged = int((wide & (at > t[i]) & (at < t[j])).sum())
     return SignalReport(
         name=samples.name,
         path=samples.spec.path,
@@ -71,22 +76,13 @@ def report_of(
         jitter_s=float(high - low) / 2,
         largest_gap_s=widest,
         largest_gap_at_s=place,
-        bridged=_bridged(samples, at),
+        bridged=bridged,
         skew_s=series.skew_s,
         not_finite=samples.not_finite,
         stamps=samples.stamps,
         low=float(values.min()),
         high=float(values.max()),
     )
-
-
-def _bridged(samples: Samples, at: Ints) -> int:
-    t = samples.t
-    if len(t) < 2:
-        return 0
-    i = np.clip(np.searchsorted(t, at, "right"), 1, len(t) - 1)
-    wide = (t[i] - t[i - 1]) * 1e-9 > BRIDGED * samples.interval
-    return int((wide & (at > t[i - 1]) & (at < t[i])).sum())
 
 
 def check_clocks(series: Mapping[str, Series]) -> list[Finding]:

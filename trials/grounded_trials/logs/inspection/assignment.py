@@ -61,10 +61,7 @@ POINTS_TO_PROPOSE = 2.0  # points from which a number is proposed whatever else 
 SURE_LEAD = 1.5  # lead over the next number, to be sure
 LEAD = 0.75  # lead of a number without a name over those that fit worse
 MOST_CANDIDATES = 20  # largest number of candidates
-UNNAMED_BESIDE, UNNAMED_AT_ALL = (
-    8,
-    60,
-)  # most numbers without a name that are tried as rates beside known ones; at all
+UNNAMED = 60  # most numbers without a name that are tried as rates
 LATEST = 0.5  # [s] a command is sought up to this long before the angle that follows it
 STATED, HOME, CAP = 1.8, 0.75, 5.0  # points, see `_Table`
 
@@ -298,7 +295,7 @@ class _Table:
         # What a name fits, else what is free, if that is little.
         own = {name: [p for p in self._near(name) if p not in sent] for name in pair}
         bare = [name for name in pair if not own[name]]
-        if len(free) <= (UNNAMED_BESIDE if first else UNNAMED_AT_ALL):
+        if len(free) <= UNNAMED:
             own |= {name: self._possible(name, free) for name in bare}
         like = self._likes(own[q], own[w])
 

@@ -218,30 +218,6 @@ def _inspected(files: tuple[Path, ...], layout: Layout) -> LogReport:
 
 
 @dataclass
-class _Range:
-    """The values of one path so far."""
-
-    path: MessagePath
-    low: float = np.inf
-    high: float = -np.inf
-    count: int = 0
-    not_finite: int = 0
-    noises: list[float] = field(default_factory=list)
-    repeated: int = 0
-
-    def add(self, values: Floats) -> None:
-        finite = values[np.isfinite(values)]
-        self.count += len(values)
-        self.not_finite += len(values) - len(finite)
-        self.repeated += int(((np.diff(values) == 0) & (values[1:] != 0)).sum())
-        if len(finite) >= NOISE_SAMPLES:
-            self.noises.append(_noise(finite))
-        if len(finite):
-            self.low = min(self.low, float(finite.min()))
-            self.high = max(self.high, float(finite.max()))
-
-
-@dataclass
 class _Topic:
     """One topic so far."""
 
@@ -252,7 +228,8 @@ class _Topic:
     log_times: list[Ints] = field(default_factory=list)
     skews: list[Ints] = field(default_factory=list)
     decoder: Decoder | None = None
-    ranges: dict[str, _Range] = field(default_factory=dict)
+    paths: dict[str, MessagePath] = field(default_factory=dict)
+    values: dict[str, list[Floats]] = field(default_factory=dict)  # at each, batch by batch
     joints: set[tuple[str, ...]] = field(default_factory=set)
 
     def add(self, batch: Messages | Rows) -> None:
@@ -276,15 +253,15 @@ class _Topic:
             self.problem = str(error)
 
     def _look(self, decoder: Decoder, part: Decoded) -> None:
-        if not self.ranges:
+        if not self.paths:
             self._find_paths(part)
         self.joints |= _joints_in(part, decoder)
-        for i, one in enumerate(self.ranges.values()):
+        for i, (path, parsed) in enumerate(self.paths.items()):
             try:
-                values = evaluate(part, one.path, stamps=i == 0)
+                values = evaluate(part, parsed, stamps=i == 0)
             except BadPath:  # of another kind in another JSON message
                 continue
-            one.add(values.values)
+            self.values.setdefault(path, []).append(values.values)
             if values.stamps is not None and len(values.stamps):
                 self.skews.append(values.stamps - part.log_times[values.rows])
 
@@ -293,7 +270,7 @@ class _Topic:
         for rest in dict.fromkeys(rest for one in part.samples for rest in number_paths(one)):
             with suppress(GroundedError):  # a name that no path can contain
                 path = parse_path(topic + rest)
-                self.ranges[path.text] = _Range(path)
+                self.paths[path.text] = path
 
     def report(self, start: int) -> TopicReport:
         t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)
@@ -301,6 +278,8 @@ class _Topic:
         low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
         median = float(np.median(gaps)) if len(gaps) else 0.0
         skews = np.concatenate(self.skews) if self.skews else None
+        numbers = {path: self.values[path] for path in self.paths if path in self.values}
+        fields = [_field(path, parts) for path, parts in numbers.items() if any(map(len, parts))]
         return TopicReport(
             topic=self.of.name,
             type=self.of.schema.name if self.of.schema else "",
@@ -313,7 +292,7 @@ class _Topic:
             last_s=float(t.max() - start) * 1e-9 if len(t) else None,
             stamped=skews is not None,
             skew_s=None if skews is None else float(np.median(skews)) * 1e-9,
-            fields=tuple(_field(p, r) for p, r in _telling(self.ranges).items() if r.count),
+            fields=tuple(_telling(fields)),
             problem=self.problem,
         )
 
@@ -325,23 +304,26 @@ def _joints_in(part: Decoded, decoder: Decoder) -> set[tuple[str, ...]]:
     return {tuple(map(str, names)) for names in fields_of(some, listed)}
 
 
-def _telling(ranges: Mapping[str, _Range]) -> dict[str, _Range]:
+def _telling(fields: Sequence[FieldReport]) -> list[FieldReport]:
     """Leave out velocities in the pose's axes if the robot only moves forwards: v says it all."""
-    ways = [r for p, r in ranges.items() if p.endswith(("linear.y", "linear.z"))]
-    if all(r.low == r.high for r in ways):
-        return {path: r for path, r in ranges.items() if f"@{WORLD}" not in path}
-    return dict(ranges)
+    ways = [one for one in fields if one.path.endswith(("linear.y", "linear.z"))]
+    ahead = all(one.low == one.high for one in ways)
+    return [one for one in fields if not (ahead and f"@{WORLD}" in one.path)]
 
 
-def _field(path: str, found: _Range) -> FieldReport:
-    none = found.low > found.high
+def _field(path: str, parts: Sequence[Floats]) -> FieldReport:
+    """Return what there is to say of a number's values, given batch by batch."""
+    some = [values[np.isfinite(values)] for values in parts]
+    finite, count = np.concatenate(some), sum(map(len, parts))
+    noises = [_noise(values) for values in some if len(values) >= NOISE_SAMPLES]
+    repeated = sum(int(((np.diff(v) == 0) & (v[1:] != 0)).sum()) for v in parts)
     return FieldReport(
         path=path,
-        low=None if none else found.low,
-        high=None if none else found.high,
-        not_finite=found.not_finite,
-        noise=float(np.median(found.noises)) if found.noises else 0.0,
-        held=found.repeated / max(found.count - 1, 1),
+        low=float(finite.min()) if len(finite) else None,
+        high=float(finite.max()) if len(finite) else None,
+        not_finite=count - len(finite),
+        noise=float(np.median(noises)) if noises else 0.0,
+        held=repeated / max(count - 1, 1),
     )
 
 
