@@ -63,9 +63,9 @@ def report_of(
     low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
     bridged = 0
     if len(t) > 1:
-        i, j = samples.around(at)
-        wide = (t[j] - t[i]) * 1e-9 > BRIDGED * samples.interval
-        bridged = int((wide & (at > t[i]) & (at < t[j])).sum())
+        before, after = (t[some] for some in samples.around(at))
+        wide = (after - before) * 1e-9 > BRIDGED * samples.interval
+        bridged = int((wide & (at > before) & (at < after)).sum())
     return SignalReport(
         name=samples.name,
         path=samples.spec.path,

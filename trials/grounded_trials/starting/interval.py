@@ -31,7 +31,7 @@ FEWEST_TIMES = 20  # smallest number of times between changes
 APART = 1.5  # smallest ratio of an interval to that of the rows
 ROUNDING = 0.03  # relative tolerance for rounding to one of STEPS
 ONCE, WITHIN = 0.25, 0.25  # share of times between changes that are the interval, within a part
-IN_STEP = 0.6  # coherence of the phases of changes
+IN_STEP, TOGETHER = 0.6, 40  # coherence of the phases of so many changes, since clocks drift
 
 
 def interval_of(
@@ -96,10 +96,12 @@ def changes_every(gaps: Array, rows: float) -> float | None:
     if len(gaps) < FEWEST_TIMES:
         return None
     changes, coherence = np.cumsum(gaps), dict[float, float]()
+    blocks = np.array_split(changes, max(1, len(changes) // TOGETHER))
     for step in STEPS:
         once = np.abs(gaps - step) <= WITHIN * step
         if APART * rows < step <= LONGEST and once.mean() >= ONCE:
-            coherence[step] = float(abs(np.exp(2j * np.pi * changes / step).mean()))
+            turns = [abs(np.exp(2j * np.pi * block / step).mean()) for block in blocks]
+            coherence[step] = float(np.median(turns))
     best = max(coherence, key=coherence.__getitem__, default=None)
     return best if best is not None and coherence[best] >= IN_STEP else None
 
