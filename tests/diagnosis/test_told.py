@@ -236,7 +236,7 @@ def test_every_effect_has_a_meaning_in_words_for_any_value():
         assert "{" not in meaning(effect, known)
 
 
-FRICTION, DRAG = "viscous_friction:v", "quadratic_drag:v"
+FRICTION = "viscous_friction:v"
 ERRORS = RulerRow(
     1.0,
     unit_by_channel={"x": "m", "v": "m/s"},
@@ -259,8 +259,8 @@ def diagnosed(**more) -> Diagnosis:
     return Diagnosis(**parts | more)
 
 
-def codes(found, adopted=()):
-    return [one.code.removeprefix("gap.") for one in remarks(found, MODEL, adopted)]
+def codes(found):
+    return [one.code.removeprefix("gap.") for one in remarks(found, MODEL)]
 
 
 def test_three_lines_say_what_how_good_and_what_is_open():

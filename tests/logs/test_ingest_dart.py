@@ -90,16 +90,14 @@ start = { path = "/safety_value.data", above = 0.5 }
 """
 
 
-def circle(speed=0.5, radius=0.8, ramp=0.5, H=160, dt=0.05):
-    """From standstill onto a circle to the left."""
-    rows, s = ["t,x,y,psi,v"], 0.0
-    for k in range(H + 1):
-        v = min(ramp * k * dt, speed)
-        psi = s / radius
-        x, y = radius * np.sin(psi), radius * (1 - np.cos(psi))
-        rows.append(f"{k * dt:.10g},{x:.6f},{y:.6f},{psi:.6f},{v:.6f}")
-        s += dt * v
-    return "\n".join(rows) + "\n"
+def circle(radius=0.8, dt=0.05):
+    """From standstill onto a circle to the left, as a target's text."""
+    t = dt * np.arange(161)
+    v = np.minimum(0.5 * t, 0.5)
+    psi = dt * np.r_[0.0, np.cumsum(v)[:-1]] / radius
+    rows = np.column_stack([t, radius * np.sin(psi), radius * (1 - np.cos(psi)), psi, v])
+    lines = [",".join(f"{value:.6f}" for value in row) for row in rows]
+    return "\n".join(["t,x,y,psi,v", *lines]) + "\n"
 
 
 def first_part(log, folder, seconds=32.0):

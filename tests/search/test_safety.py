@@ -115,13 +115,12 @@ T = np.linspace(0.0, 1.0, STEPS + 1)
 WAY = 10 * T**3 - 15 * T**4 + 6 * T**5
 
 
-def task_of(model, ends, limit, bound, held=0.0):
+def task_of(model, ends, limit, bound):
     """A manoeuvre from rest to rest, in ten seconds, inside bounds of all states."""
     n = model.n
     target = np.outer(WAY, ends)
     safety = {"safety_low": np.full(n, -bound), "safety_high": np.full(n, bound)}
-    past = np.full(model.m, held)
-    return plain_task(model, 0.05, target, 10.0, limit, change=0.01, past=past, **safety)
+    return plain_task(model, 0.05, target, 10.0, limit, change=0.01, **safety)
 
 
 HANGING = replace(pendulum.model, params={**pendulum.model.params, "g": Param(9.81)})
@@ -189,14 +188,9 @@ def test_the_probability_is_the_t_tests():
     assert Difference(*history, history).freedom == 4
 
 
-def promising(gain, utilities=(-1.2, -1.0), deviation=0.1, doubtful=False):
-    best = replace(tried(*utilities), deviation=deviation)
-    made = SimpleNamespace(id="c2", base="c", promised_over=lambda _: gain, doubtful=doubtful)
-    return made, best
-
-
 def test_more_repeats_of_each_candidate_show_smaller_gains():
-    made, best = promising(0.1, utilities=(-1.0,) * 9)
+    best = replace(tried(*(-1.0,) * 9), deviation=0.1)
+    made = SimpleNamespace(id="c2", base="c", promised_over=lambda _: 0.1, doubtful=False)
     assert in_question(made, best) and not in_question(made, best, repeats=9)
 
 

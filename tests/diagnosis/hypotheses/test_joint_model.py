@@ -31,13 +31,11 @@ def searched(model, trials):
     return HypothesisSearch(data, few, joints=Library().joints(model, data.scales))
 
 
-def of_all_joints(model, trials, alone=False):
+def of_all_joints(model, trials):
     """By effect, its values in the likeliest model of all joints; None without one."""
     search = searched(model, trials)
     with np.errstate(all="ignore"):
         search.nulls()
-        if alone:
-            search.extended(search.best_null())
         found = joint_model(search)
     return None if found is None else {e.name: values for e, values in found.hypothesis.pairs}
 

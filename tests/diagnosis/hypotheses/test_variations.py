@@ -130,8 +130,8 @@ MOTOR = Model(
     },
     derivative=lambda s, a, p: {"q": s.w, "w": (p.K * a.volt - s.w) / p.tau},
 )
-JOINT, LOADED = "joint_friction:volt<-w", "load_friction:volt<-w"
-FRICTION, K, TAU, _DT = 0.35, 0.88, 0.06, 0.02
+JOINT = "joint_friction:volt<-w"
+FRICTION, K, TAU = 0.35, 0.88, 0.06
 
 
 @pytest.fixture(scope="module")

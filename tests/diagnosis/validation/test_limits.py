@@ -337,14 +337,14 @@ def test_a_gain_beside_an_uncertain_mass_is_as_uncertain_as_the_mass():
     ]
 
 
-def planar(gravity=0.0):
+def planar():
     """Two joints in a horizontal plane: all torques and inertias may be larger by one factor."""
 
     def rates(s, a, p):
         mc, h = p.I2 + 0.06 * p.load, 0.07 + 0.075 * p.load
         c, sn = np.cos(s.q2), np.sin(s.q2)
         M11, M12 = 0.2 + p.I1 + 0.09 * p.load + mc + 2 * h * c, mc + h * c
-        r1 = a.t1 + h * sn * (2 * s.w1 * s.w2 + s.w2**2) - gravity * np.sin(s.q1)
+        r1 = a.t1 + h * sn * (2 * s.w1 * s.w2 + s.w2**2)
         r2, det = a.t2 - h * sn * s.w1**2, M11 * mc - M12**2
         w1, w2 = (mc * r1 - M12 * r2) / det, (M11 * r2 - M12 * r1) / det
         return {"q1": s.w1, "q2": s.w2, "w1": w1, "w2": w2}

@@ -110,14 +110,14 @@ def test_a_loop_slower_than_dt_is_told(w, every):
     assert all(one.facts["every"] == pytest.approx(every * dt) for one in told)
 
 
-def by_hand(w, wired, drag=3.0, seed=5):
+def by_hand(w, wired, seed=5):
     """Drive the cart by hand, with a motor wired right or wrong and a drag the model lacks."""
     rng, (x, v) = np.random.default_rng(seed), (0.0, 0.0)
     states, inputs, goals = [(x, v)], [], rng.uniform(-1.0, 1.0, 10)
     for k in range(120):
         force = np.clip(4.0 * (goals[k // 15] - x) + 0.5 * rng.normal(), -5.0, 5.0)
         for _ in range(20):
-            v += 0.0025 * (wired * force - drag * v) / 1.4
+            v += 0.0025 * (wired * force - 3.0 * v) / 1.4
             x += 0.0025 * v
         states.append((x, v))
         inputs.append((force,))

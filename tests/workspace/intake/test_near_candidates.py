@@ -196,11 +196,11 @@ def candidate(gain, seed=1, name="c0003"):
     )
 
 
-def balanced(ran, seed=0, factor=1.0, after=100):
+def balanced(ran, seed):
     """Balance by hand for 1.5 s, then by a policy with late commands and a loop that jitters."""
     rng, queue, u = np.random.default_rng(seed), [], 0.0
     x, now, rows = np.array([0.0, 0.0]), 0.0, []
-    for k in range(WAITS + STEPS + after):
+    for k in range(WAITS + STEPS + 100):
         t = k * DT + abs(rng.normal(0, 0.0008))
         while now < t:
             while queue and queue[0][0] <= now:
@@ -213,7 +213,7 @@ def balanced(ran, seed=0, factor=1.0, after=100):
         if 0 <= step < STEPS:
             one = ran.policy
             sent = one.feedforward[step, 0]
-            sent += one.gain[step, 0, :2] @ (factor * felt - one.reference[step, :2])
+            sent += one.gain[step, 0, :2] @ (felt - one.reference[step, :2])
         else:
             sent = HAND @ felt
         sent = float(np.clip(sent, -LIMIT, LIMIT))
