@@ -81,7 +81,6 @@ def oracle(
             for fit in search.refined([start], 12):
                 search.calibrated(fit)
         found = [f for f in search.of_size(len(h.names)) if {*f.hypothesis.names} == {*h.names}]
-        search.fair(found[0])
         return search.score(found[0])
 
     whole, each = fitted(effects), dict[str, float]()

@@ -17,7 +17,6 @@ from grounded.diagnosis.hypotheses.joint_model import joint_model
 from grounded.diagnosis.hypotheses.search import (
     LARGE_GAIN,
     SHORTLIST,
-    STATES_LARGE,
     TO_THE_TOP,
     HypothesisSearch,
 )
@@ -25,7 +24,6 @@ from grounded.diagnosis.hypotheses.variations import (
     HOPEFUL,
     TUNED,
     swapped,
-    sweep,
     tune,
     varied,
 )
@@ -41,7 +39,6 @@ from grounded.result import listed
 USUAL_EFFECTS = 3  # most effects searched for at first
 AT_FIRST = 8  # iterations of the first fit of a further effect
 ROUNDS = 2  # most rounds of that, since others may become the likeliest
-RESTARTED = 3  # large effects that are also fitted from a start of their own
 
 
 def attribute(
@@ -135,8 +132,6 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
         more = search.score(whole) - search.score(search.of_size(1)[0])
         if more > LARGE_GAIN and (limit is None or len(whole.hypothesis.effects) <= limit):
             return whole
-    search.again(search.of_size(1)[: RESTARTED if search.data.model.n <= STATES_LARGE else 2])
-    sweep(search)
     search.beside_parameters()
     best = search.of_size(1)[0]
     for _ in range(3):  # with the noise that the best one leaves, others may look better
@@ -150,9 +145,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
             break
     search.refined(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
     tune(search, search.of_size(1)[:TUNED])
-    best = search.of_size(1)[0]
-    search.fair(best)
-    return max([best, search.best_null()], key=search.score)
+    return max([search.of_size(1)[0], search.best_null()], key=search.score)
 
 
 def _kind(fit: Fitted) -> tuple[object, ...]:
@@ -201,7 +194,6 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         added = [search.extended(start, AT_FIRST) for start in starts]
         firsts = [max(fits, key=search.score) for fits in added if fits]  # noise differs between
         search.refined(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
-        search.again(search.of_size(size + 1)[:2])
         search.refined(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
         for fit in search.of_size(size + 1)[:TUNED]:

@@ -150,31 +150,6 @@ class HypothesisSearch(FittedHypotheses):
         weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
         return h, replace(noise, weight_w=weight_w, weight_v=weight_v), track
 
-    def again(self, fits: Sequence[Fitted]) -> list[Fitted]:
-        """Refit large effects from a fresh start, as the noise of a fit without them is far off."""
-        floor = self.score(self.best_null()) + LARGE_GAIN
-        far = [f for f in fits if self.score(f) > floor]
-        tried = [f.hypothesis for f in far]
-        tried += [replace(h, shift=None, spread=0.0) for h in tried[:1] if h.spread > 0]
-        starts = []
-        for h in tried:
-            start, noise, track = self.fresh(h)
-            weight_w, weight_v = far[0].noise.weight_w, far[0].noise.weight_v
-            starts.append((start, replace(noise, weight_w=weight_w, weight_v=weight_v), track))
-        return self.refined(starts, iterations=12)
-
-    def fair(self, best: Fitted) -> None:
-        """Refit the model alone from the noise and the shifts of the best hypothesis.
-
-        The reference must have converged, or a better noise model would be taken for an effect.
-        """
-        h = best.hypothesis
-        bare = Hypothesis(shift=h.shift, spread=h.spread), best.noise, best.track
-        if best.noise.structure.tau is None:
-            self.coloured(*bare, iterations=8)
-        (alone,) = self.refined([bare], iterations=12)
-        self.calibrated(alone)
-
     def coloured(
         self, h: Hypothesis, noise: NoiseModel, track: Array, *, iterations: int
     ) -> list[Fitted]:

@@ -21,7 +21,6 @@ from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, Hypothe
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.refine import refine
 from grounded.effects import Effect, InputFamily, MemoryFamily
 from grounded.effects.actuator import delay
 from grounded.effects.drive import motion_of, push
@@ -176,7 +175,6 @@ def in_place(h: Hypothesis, change: Change) -> Hypothesis:
 
 FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is changed
 STEPS = 12  # most changes of a constant
-WIDEST, TRIED = 100.0, 7  # sweep of a constant: its range as a factor, number of values tried
 
 
 def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
@@ -195,30 +193,6 @@ def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
             for q in effect.quantities:
                 if q.tunable:
                     fit = _walked(search, fit, index, q.name)
-
-
-def sweep(search: HypothesisSearch) -> None:
-    """Try constants over their whole range for every effect, before effects are compared.
-
-    Otherwise a dry friction that builds up slowly would lose to a dead zone because of its constant
-    alone. Fits with large gains are kept, and further effects are scanned with their constants.
-    """
-    null = search.score(search.best_null())
-    starts = [
-        (fit.hypothesis.tuned(0, q.name, float(value)), fit.noise, fit.track)
-        for fit in search.of_size(1)
-        if search.score(fit) > null
-        for q in fit.hypothesis.effects[0].quantities
-        if q.tunable
-        for value in np.geomspace(max(q.low, q.high / WIDEST), q.high, TRIED)
-    ]
-    swept = refine(search.predictor, starts, iterations=TO_THE_TOP, worth=search.score)
-    large = [fit for fit in swept if search.score(fit) > null + LARGE_GAIN]
-    search.keep(large)
-    names = {fit.hypothesis.names for fit in large}
-    best = [f.hypothesis for f in search.of_size(1) if f.hypothesis.names in names]
-    known = {h.names[0]: h.effects[0] for h in best}
-    search.candidates = tuple(known.get(e.name, e) for e in search.candidates)
 
 
 def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fitted:
