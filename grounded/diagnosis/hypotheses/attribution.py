@@ -1,10 +1,10 @@
-"""The search for effects: forward selection by evidence, with swaps and removals.
+"""The search for effects: forward selection by evidence, with variations and removals.
 
 The model without effects is fitted under white noise, coloured noise and heavy tails, and with its
 parameters calibrated. Every candidate is scanned beside the likely ones of these fits, and a
 shortlist is refined. The scan is repeated with the noise of the best hypothesis. Further effects
-are added while the evidence rises, and each effect is replaced where another one explains the data
-better. Confirmation on held-out trials follows later (`validation`).
+are added while the evidence rises, and each set is varied (`variations`). Confirmation on held-out
+trials follows later (`validation`).
 """
 
 from __future__ import annotations
@@ -23,22 +23,21 @@ from grounded.diagnosis.hypotheses.search import (
 from grounded.diagnosis.hypotheses.variations import (
     HOPEFUL,
     TUNED,
-    swapped,
     tune,
     varied,
 )
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data, fewer
 from grounded.diagnosis.likelihood.fitted import Fitted
-from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
 from grounded.effects import Effect
 from grounded.progress import interruptible
 from grounded.result import listed
 
 USUAL_EFFECTS = 3  # most effects searched for at first
-AT_FIRST = 8  # iterations of the first fit of a further effect
-ROUNDS = 2  # most rounds of that, since others may become the likeliest
+SOME = 8  # effects that are tried beside others
+RIVALS, BEHIND = 3, 25.0  # single effects that are extended, at most so many nats behind the best
+ROUNDS = 2  # most rounds of convergence, since others may become the likeliest
 
 
 def attribute(
@@ -119,9 +118,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
     `limit` effects (None: any number), return that hypothesis.
     """
     null = search.best_null()
-    plain = search.fits.get((Structure(), 0.0, ()), null)
-    for context in [null] if plain is null else [null, plain]:
-        search.extended(context)
+    search.extended(null)
     singles = search.of_size(1)
     if not singles:
         return null
@@ -133,25 +130,14 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
         if more > LARGE_GAIN and (limit is None or len(whole.hypothesis.effects) <= limit):
             return whole
     search.beside_parameters()
+    # with the noise that the best one leaves, others may look better
     best = search.of_size(1)[0]
-    for _ in range(3):  # with the noise that the best one leaves, others may look better
-        search.extended(search.without(best, best.hypothesis.names[-1]))
-        search.structures(best)
-        search.calibrated(best)
-        again = search.of_size(1)[0]
-        same = _kind(again) == _kind(best)
-        best = again
-        if same:
-            break
+    search.extended(search.without(best, best.hypothesis.names[-1]))
+    search.structures(best)
+    search.calibrated(best)
     search.refined(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
     tune(search, search.of_size(1)[:TUNED])
     return max([search.of_size(1)[0], search.best_null()], key=search.score)
-
-
-def _kind(fit: Fitted) -> tuple[object, ...]:
-    """Return a fit's effects, noise structure and prior width, which its rivals must share."""
-    h = fit.hypothesis
-    return h.names, fit.noise.structure, h.spread
 
 
 def outliers(fit: Fitted) -> bool:
@@ -161,27 +147,8 @@ def outliers(fit: Fitted) -> bool:
     return count > 4 + 3 * expected
 
 
-def _starts(search: HypothesisSearch, size: int, best: Fitted) -> list[Fitted]:
-    """Return the fits to extend by one effect.
-
-    These are a set that was chosen, the likeliest, and the same under white noise with exact
-    parameters, because coloured noise or parameters may have absorbed the further effect.
-    """
-    likely = [
-        f
-        for f in search.of_size(size)[: 3 if size == 1 else 1]
-        if search.score(f) > search.score(best) - 25
-    ]
-    found = [best, *(f for f in likely if f is not best)]
-    for fit in likely[:2]:
-        plain = search.fits.get((Structure(), 0.0, tuple(sorted(fit.hypothesis.names))))
-        if plain is not None and plain not in found:
-            found.append(plain)
-    return found
-
-
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
-    """Return the likeliest of up to `most` effects: add one, then try to replace each, repeat.
+    """Return the likeliest of up to `most` effects: extend the likeliest by one, repeat.
 
     A part of a larger set may be likelier than the set that was extended to it, and is extended in
     turn.
@@ -189,37 +156,26 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
     size, done = len(best.hypothesis.effects), set[frozenset[str]]()
     while 1 <= size < most:
         best = varied(search, best)
-        starts = _starts(search, size, best)
+        floor = search.score(best) - BEHIND
+        others = search.of_size(size)[: RIVALS if size == 1 else 1]
+        starts = [best, *(f for f in others if f is not best and search.score(f) > floor)]
         done |= {frozenset(fit.hypothesis.names) for fit in starts}
-        added = [search.extended(start, AT_FIRST) for start in starts]
-        firsts = [max(fits, key=search.score) for fits in added if fits]  # noise differs between
-        search.refined(list(dict.fromkeys([*search.of_size(size + 1)[:HOPEFUL], *firsts])), 10)
+        for start in starts:
+            search.extended(start, SOME)
+        search.refined(search.of_size(size + 1)[:HOPEFUL], 10)
         search.refined(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
         tune(search, search.of_size(size + 1)[:TUNED])
         for fit in search.of_size(size + 1)[:TUNED]:
-            search.structures(fit)
             search.calibrated(fit)
         larger = search.of_size(size + 1)
         if larger:
             _nested(search, larger[0])
             best = search.of_size(size)[0]
         if larger and not search.score(larger[0]) < search.score(best) + NATS:
-            best = swapped(search, larger[0])
-            size = len(best.hypothesis.effects)
+            best, size = larger[0], size + 1
         elif not larger or frozenset(best.hypothesis.names) in done:
             break
-    for _ in range(most):  # what was fitted last may have given the chosen set its constants
-        chosen = search.chosen(most)
-        _nested(search, chosen)
-        if search.chosen(most) is chosen:
-            break
     chosen = search.chosen(most)
-    varied(search, chosen)
-    if (plain := search.chosen(most)) is not chosen:
-        _nested(search, plain)
-        chosen = search.chosen(most)
-        if len(chosen.hypothesis.effects) < most and frozenset(chosen.hypothesis.names) not in done:
-            return grown(search, chosen, most)
     size = len(chosen.hypothesis.effects)
     if size < most and (late := search.late_sensors(chosen)):
         search.settled(search.refined(late, TO_THE_TOP))

@@ -1,10 +1,9 @@
 """Variations of a set of effects that say the same in other terms, for the rule to choose from.
 
-A set that grew one effect at a time may have begun with a wrong one, may blame more than it needs,
-or name an effect that another one contains. So it is varied, and every variation is fitted until it
-converges, with constants of its own:
+A set that grew one effect at a time may blame more than it needs, or name an effect that another
+one contains. So it is varied, and every variation is fitted until it converges, with constants of
+its own:
 
-    another effect  one of them is replaced by any other that fits better beside the rest
     one for several effects of single inputs become one of several inputs (`delay:a+b`)
     fewer inputs    an effect of several inputs becomes one of some of them, or one of each
     plain friction  a richer friction of a joint becomes its plain dry friction
@@ -28,33 +27,11 @@ from grounded.effects.joint import joint_friction, load_friction
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
 TUNED = 2  # best larger sets whose constants are optimised
-ROUNDS = 3  # most rounds; after one, another set may be better
-AT_FIRST = 6  # iterations of the first fit of a swapped effect
 LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
 
 Change = Mapping[
     str, tuple[tuple[Effect, Mapping[str, float]], ...]
 ]  # effect -> those in its place
-
-
-def swapped(search: HypothesisSearch, best: Fitted) -> Fitted:
-    """Replace effects of a set by others while its evidence rises; return the likeliest fit.
-
-    All fits are added to the search. The result may have fewer effects than `best`.
-    """
-    size = len(best.hypothesis.effects)
-    for _ in range(ROUNDS):
-        known = {fit.hypothesis.names for fit in search.of_size(size)[:HOPEFUL]}
-        for name in best.hypothesis.names:  # does another effect fit better beside the others?
-            search.extended(search.without(best, name), AT_FIRST)
-        varied(search, best)
-        new = [f for f in search.of_size(size)[:HOPEFUL] if f.hypothesis.names not in known]
-        search.refined(new, TO_THE_TOP)
-        tune(search, [search.latest(fit) for fit in new])
-        before, best = best, search.of_size(size)[0]
-        if set(best.hypothesis.names) == set(before.hypothesis.names):
-            break
-    return max([best, *search.of_size(size - 1)[:1]], key=search.score)
 
 
 def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
