@@ -29,6 +29,7 @@ from grounded.diagnosis.hypotheses.variations import (
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data, fewer
 from grounded.diagnosis.likelihood.fitted import Fitted
+from grounded.diagnosis.likelihood.noise import Structure
 from grounded.diagnosis.likelihood.refine import clean
 from grounded.effects import Effect
 from grounded.progress import interruptible
@@ -118,7 +119,9 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
     `limit` effects (None: any number), return that hypothesis.
     """
     null = search.best_null()
-    search.extended(null)
+    plain = search.fits.get((Structure(), 0.0, ()), null)
+    for context in [null] if plain is null else [null, plain]:
+        search.extended(context)
     singles = search.of_size(1)
     if not singles:
         return null
