@@ -46,7 +46,7 @@ def columns(
     """
     block = _Block(rows, types, classes)
     message = block.of_type(name)
-    if not 0 <= rows.shape[1] - block.at < HEAD:
+    if rows.shape[1] - block.at not in range(4):  # some writers fill the last word
         raise Uneven
     return message
 
@@ -60,9 +60,10 @@ class _Block:
         self.rows, self.types, self.classes = rows, types, classes
         self.at = HEAD
         head = rows[:, :HEAD]
-        if head.shape[1] < HEAD or (head != head[0]).any() or head[0, 0] or head[0, 1] > 1:
+        order = head[0].tobytes()[:2]
+        if (head != head[0]).any() or order not in (b"\0\0", b"\0\1"):
             raise Uneven
-        self.order: Literal["<", ">"] = "<" if head[0, 1] else ">"
+        self.order: Literal["<", ">"] = "<" if order[1] else ">"
 
     def of_type(self, name: str) -> Any:
         """Read a message, or one inside it."""
