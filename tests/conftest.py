@@ -10,10 +10,10 @@ from pathlib import Path
 import pytest
 
 from grounded_trials.workspace.folder import Folder
-from reported import car, cart
+from reported import car, cart, learnt
 from shared_data import DATA
 
-__all__ = ["car", "cart"]  # fixtures of all tests
+__all__ = ["car", "cart", "learnt"]  # fixtures of all tests
 
 EXTRAS = {
     "view": "rerun",

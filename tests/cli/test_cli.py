@@ -21,7 +21,6 @@ from grounded.policy import load
 from grounded_cli.commands import cli
 from grounded_trials.starting.examples import EXAMPLES
 from grounded_trials.workspace.folder import Folder
-from reported import copied
 from shared_data import data, needs_data
 from workspaces import make
 
@@ -284,11 +283,6 @@ def test_fit_shows_values_with_intervals_and_applies_them(w):
     assert wrong.code == 1 and holds(wrong.err, "drg", "'drag'")
 
 
-@pytest.fixture
-def learnt(cart, tmp_path):
-    return copied(cart, tmp_path / "w")
-
-
 def last(done):
     assert done.code == 0, done.err
     return plain(done.out).rstrip().splitlines()[-1]
@@ -387,18 +381,16 @@ def test_a_workspace_without_trials_has_a_report_and_no_diagnosis(tmp_path):
         assert done.code == 1 and holds(done.err, "ingest", "--data")
 
 
-def test_reports_may_be_deleted(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    shutil.rmtree(folder / "reports")
-    first = grounded("-C", folder, "report", "--html", "--json").json
-    shutil.rmtree(folder / "reports")
-    assert grounded("-C", folder, "report", "--html", "--json").json == first
-    assert grounded("-C", folder, "status").code == 0
+def test_reports_may_be_deleted(learnt):
+    shutil.rmtree(learnt / "reports")
+    first = grounded("-C", learnt, "report", "--html", "--json").json
+    shutil.rmtree(learnt / "reports")
+    assert grounded("-C", learnt, "report", "--html", "--json").json == first
+    assert grounded("-C", learnt, "status").code == 0
 
 
-def test_fit_then_learn_reaches_as_far(cart, tmp_path):
-    w = copied(cart, tmp_path / "w")
-    before = grounded("-C", w, "status", "--json").json["best"]["utility"]
-    assert grounded("-C", w, "fit", "--latency", "--apply").code == 0
-    done = grounded("-C", w, "learn", "--json").json
+def test_fit_then_learn_reaches_as_far(learnt):
+    before = grounded("-C", learnt, "status", "--json").json["best"]["utility"]
+    assert grounded("-C", learnt, "fit", "--latency", "--apply").code == 0
+    done = grounded("-C", learnt, "learn", "--json").json
     assert done["best"]["utility"] >= before

@@ -12,7 +12,7 @@ from facts import holds
 from grounded_trials import Workspace
 from grounded_trials.store.documents import write_document
 from grounded_trials.store.trial_file import read_trial
-from reported import DIAGNOSIS, copied
+from reported import DIAGNOSIS
 from workspaces import CONFIG, MODEL, make
 
 DART_LOG = """
@@ -323,11 +323,6 @@ def test_a_damaged_candidate_says_what_to_do(w, trial):
     assert done.code == 1 and "c0001" in done.err and "Traceback" not in done.err
     path.unlink()
     assert grounded("-C", w, "propose").code == 0
-
-
-@pytest.fixture
-def learnt(cart: Path, tmp_path: Path) -> Path:
-    return copied(cart, tmp_path / "w")
 
 
 def test_trials_may_be_given_as_a_list_with_commas_and_twice(learnt):

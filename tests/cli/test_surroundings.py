@@ -17,7 +17,6 @@ from cli import grounded, process
 from grounded_cli.commands import cli
 from grounded_cli.console import terminal
 from grounded_cli.console.terminal import field, harmless, table
-from reported import copied
 
 
 def test_a_wide_table_breaks_the_names_of_its_columns():
@@ -220,18 +219,16 @@ COMMANDS = [
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_every_key_is_documented(cart, tmp_path, words):
-    folder = copied(cart, tmp_path / "w")
-    trial = next((folder / "trials").glob("t0001*"))
+def test_every_key_is_documented(learnt, tmp_path, words):
+    trial = next((learnt / "trials").glob("t0001*"))
     (log := tmp_path / "log.csv").write_text(LOG)
-    fits(folder, [word.format(folder=folder, trial=trial, log=log) for word in words])
+    fits(learnt, [word.format(folder=learnt, trial=trial, log=log) for word in words])
 
 
-def test_what_follows_an_adoption_is_documented(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    assert grounded("-C", folder, "adopt", "viscous_friction:v").code == 0
-    fits(folder, ["export", "--library", tmp_path / "actuator.yaml"])
-    fits(folder, ["adopt", "--undo"])
+def test_what_follows_an_adoption_is_documented(learnt, tmp_path):
+    assert grounded("-C", learnt, "adopt", "viscous_friction:v").code == 0
+    fits(learnt, ["export", "--library", tmp_path / "actuator.yaml"])
+    fits(learnt, ["adopt", "--undo"])
 
 
 def fits(folder, words):

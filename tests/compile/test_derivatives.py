@@ -70,14 +70,8 @@ trees = st.recursive(
 
 def evaluated(tree, s, a, p):
     if isinstance(tree, str):
-        return {
-            "s.x": lambda: s.x,
-            "s.v": lambda: s.v,
-            "a.u": lambda: a.u,
-            "p.c": lambda: p.c,
-            "p.d": lambda: p.d,
-            "1.3": lambda: 1.3,
-        }[tree]()
+        of, _, name = tree.partition(".")
+        return 1.3 if of == "1" else getattr({"s": s, "a": a, "p": p}[of], name)
     if len(tree) == 2:
         return UNARY[tree[0]](evaluated(tree[1], s, a, p))
     return BINARY[tree[0]](evaluated(tree[1], s, a, p), evaluated(tree[2], s, a, p))

@@ -51,9 +51,8 @@ def test_json_holds_what_the_contract_says(cart):
 
 @pytest.mark.slow
 @pytest.mark.extra("view", "png")
-def test_json_names_the_files_that_were_written(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    paths = grounded("-C", folder, "report", "--html", "--rrd", "--png", "--json").json["paths"]
+def test_json_names_the_files_that_were_written(learnt):
+    paths = grounded("-C", learnt, "report", "--html", "--rrd", "--png", "--json").json["paths"]
     files = [paths["html"], paths["rrd"], *paths["png"]]
     assert all(Path(file).stat().st_size > 1000 for file in files)
     assert {Path(p).stem for p in paths["png"]} >= {"utility", "paths", "states", "bias"}
@@ -68,43 +67,39 @@ def test_a_workspace_without_trials_has_a_report(tmp_path):
 
 
 @pytest.mark.extra("view", "png")
-def test_a_damaged_trial_is_left_out_and_named(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    path = damage(folder, "trials/t0002-*")
-    done = grounded("-C", folder, "report")
+def test_a_damaged_trial_is_left_out_and_named(learnt):
+    path = damage(learnt, "trials/t0002-*")
+    done = grounded("-C", learnt, "report")
     assert done.code == 3
     assert path.name in done.out
     assert plain(done.out).rstrip().split("\n")[-1].startswith("next: grounded ")
-    document = grounded("-C", folder, "report", "--json", "--html", "--rrd")
+    document = grounded("-C", learnt, "report", "--json", "--html", "--rrd")
     assert document.code == 3
     assert document.json["lost"][0]["file"] == path.name
     assert path.name in Path(document.json["paths"]["html"]).read_text()
 
 
 @pytest.mark.extra("view", "png")
-def test_all_trials_may_be_lost(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    for number, path in enumerate(sorted(folder.glob("trials/*.mcap"))):
+def test_all_trials_may_be_lost(learnt):
+    for number, path in enumerate(sorted(learnt.glob("trials/*.mcap"))):
         path.chmod(0o644)
         path.write_bytes(b"" if number % 2 else b"\x89MCAP0\r\n nonsense")
-    done = grounded("-C", folder, "report", "--html", "--png", "--rrd")
+    done = grounded("-C", learnt, "report", "--html", "--png", "--rrd")
     assert done.code == 3, done.err
 
 
-def test_a_damaged_candidate_is_taken_from_the_trial_that_ran_it(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    damage(folder, "candidates/c0002.mcap")
-    (folder / "candidates" / "c0001.mcap").unlink()
-    done = grounded("-C", folder, "report", "--json")
+def test_a_damaged_candidate_is_taken_from_the_trial_that_ran_it(learnt, cart):
+    damage(learnt, "candidates/c0002.mcap")
+    (learnt / "candidates" / "c0001.mcap").unlink()
+    done = grounded("-C", learnt, "report", "--json")
     assert done.code == 0, done.err
     assert done.json["utilities"] == grounded("-C", cart, "report", "--json").json["utilities"]
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"verdict": 3}', "\x00", "[" * 100_000])
-def test_a_damaged_diagnosis_is_named(cart, tmp_path, text):
-    folder = copied(cart, tmp_path / "w")
-    (folder / "reports" / "diagnosis.json").write_text(text)
-    done = grounded("-C", folder, "report", "--json")
+def test_a_damaged_diagnosis_is_named(learnt, text):
+    (learnt / "reports" / "diagnosis.json").write_text(text)
+    done = grounded("-C", learnt, "report", "--json")
     assert done.code == 3
     (lost,) = done.json["lost"]
     assert lost["file"] == "diagnosis.json" and lost["reason"]
@@ -186,22 +181,17 @@ def written(folder: Path, **more) -> Workspace:
     return Workspace(folder)
 
 
-@pytest.fixture
-def folder(cart, tmp_path):
-    return copied(cart, tmp_path / "w")
-
-
-def test_what_was_adopted_is_told_everywhere(folder, cart):
+def test_what_was_adopted_is_told_everywhere(learnt, cart):
     assert Workspace(cart).report().to_json()["adopted"] is None
-    w = written(folder)
+    w = written(learnt)
     w.adopt(FRICTION)
-    done = grounded("-C", folder, "report", "--html", "--json").json["adopted"]
+    done = grounded("-C", learnt, "report", "--html", "--json").json["adopted"]
     assert "0.300 +- 0.010 1/s" in done["clauses"][0]
     assert done["clauses"][1] == "mass: 1.400 +- 0.020 kg, was 1"
     page = (w.reports / "report.html").read_text().replace("\xa0", " ")
-    for text in (grounded("-C", folder, "report").out, re.sub(r"<[^>]+>", "", page)):
+    for text in (grounded("-C", learnt, "report").out, re.sub(r"<[^>]+>", "", page)):
         assert re.search(r"12\s+mm\s+instead\s+of\s+250\s+mm", text)
-    (block,) = parameter_table(gather(Folder(folder)))
+    (block,) = parameter_table(gather(Folder(learnt)))
     row = dict(zip(block.header, next(r for r in block.rows if r[0] == "mass"), strict=True))
     assert (row["in model.py"], row["now"]) == ("1.000", "1.400")
     assert row["diagnosed "].startswith("1.400 +- 0.020")
@@ -249,10 +239,10 @@ ADOPTIONS = {  # a diagnosis, what is then known only jointly, and what stays be
 
 
 @pytest.mark.parametrize("case", ADOPTIONS)
-def test_what_is_adopted_is_what_the_trials_tell(folder, case):
+def test_what_is_adopted_is_what_the_trials_tell(learnt, case):
     changes, jointly, left = ADOPTIONS[case]
-    w = written(folder, **changes)
-    shown = grounded("-C", folder, "adopt", FRICTION)
+    w = written(learnt, **changes)
+    shown = grounded("-C", learnt, "adopt", FRICTION)
     assert shown.code == 0 and all(name.split("_")[0] in shown.err for name in left)
     w.undo_adoption()
     done = w.adopt(FRICTION).to_json()
@@ -261,10 +251,10 @@ def test_what_is_adopted_is_what_the_trials_tell(folder, case):
 
 
 @pytest.mark.parametrize("value", [0.05, -0.05])
-def test_a_sensor_s_bias_is_said_to_move_start_and_target(folder, value):
+def test_a_sensor_s_bias_is_said_to_move_start_and_target(learnt, value):
     text = json.dumps(DIAGNOSIS).replace(FRICTION, "sensor_bias:v")
-    written(folder, **json.loads(text.replace('"k": {"value": 0.3', f'"b": {{"value": {value}')))
-    done = grounded("-C", folder, "adopt", "sensor_bias:v")
+    written(learnt, **json.loads(text.replace('"k": {"value": 0.3', f'"b": {{"value": {value}')))
+    done = grounded("-C", learnt, "adopt", "sensor_bias:v")
     assert done.code == 0 and f"offset {-value:+}" in " ".join(done.err.split())
 
 
@@ -272,29 +262,27 @@ needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX 
 
 
 @pytest.mark.extra("view")
-def test_without_a_screen_the_recording_is_written_and_named(cart, tmp_path, monkeypatch):
-    folder = copied(cart, tmp_path / "w")
+def test_without_a_screen_the_recording_is_written_and_named(learnt, monkeypatch):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     monkeypatch.setattr(sys, "platform", "linux")
-    done = grounded("-C", folder, "view")
+    done = grounded("-C", learnt, "view")
     assert done.code == 1
     assert holds(done.err, "recording.rrd", "rerun")
-    assert (folder / "reports" / "recording.rrd").stat().st_size > 1000
+    assert (learnt / "reports" / "recording.rrd").stat().st_size > 1000
 
 
 @pytest.mark.slow
 @needs_posix
 @pytest.mark.extra("view")
 @pytest.mark.parametrize(("ending", "code"), [("exit 3", 1), ("sleep 3", 0)])
-def test_the_viewer_is_started_for_this_machine_alone(cart, tmp_path, monkeypatch, ending, code):
-    folder = copied(cart, tmp_path / "w")
+def test_the_viewer_is_started_for_this_machine_alone(learnt, tmp_path, monkeypatch, ending, code):
     program = tmp_path / "rerun"
     program.write_text(f'#!/bin/sh\necho "$@" > {tmp_path}/words\n{ending}\n')
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
     monkeypatch.setenv("DISPLAY", ":7")
     monkeypatch.setattr(report.sys, "executable", str(tmp_path / "python"))
-    done = grounded("-C", folder, "view")
+    done = grounded("-C", learnt, "view")
     assert done.code == code, done.err
     assert "Traceback" not in done.err
     words = (tmp_path / "words").read_text().split()

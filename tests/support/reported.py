@@ -84,6 +84,12 @@ def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def learnt(cart: Path, tmp_path: Path) -> Path:
+    """The learnt workspace of a cart, for a test that changes it."""
+    return copied(cart, tmp_path / "w")
+
+
 @pytest.fixture(scope="session")
 def car(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A workspace of an RC car after three trials, not diagnosed."""

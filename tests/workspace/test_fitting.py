@@ -21,7 +21,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.where_to_mend import where_to_mend
-from reported import copied
 from workspaces import CONFIG, edit, make
 
 DT = 0.05
@@ -201,15 +200,15 @@ def test_an_offset_that_is_found_adds_to_that_of_log(w, has, mended):
     assert keys_of(one.log) == mended
 
 
-def learnt(folder, trials=2, **files):
+def searched(folder, **files):
     ended = Workspace(make(folder, **files).folder)
-    ended.learn(trials)
+    ended.learn(2)
     return ended
 
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
-    return learnt(tmp_path_factory.mktemp("identity") / "w")
+    return searched(tmp_path_factory.mktemp("identity") / "w")
 
 
 @pytest.fixture
@@ -217,10 +216,9 @@ def ended(made, tmp_path):
     return Workspace(shutil.copytree(made.folder, tmp_path / "w"))
 
 
-def test_every_flipped_bit_of_a_diagnosis_is_found(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    ended = Workspace(folder)
-    path = folder / "reports" / "diagnosis.json"
+def test_every_flipped_bit_of_a_diagnosis_is_found(learnt):
+    ended = Workspace(learnt)
+    path = learnt / "reports" / "diagnosis.json"
     data, silent = path.read_bytes(), 0
     assert read_diagnosis(ended.reports) is not None
     for bit in range(0, 8 * len(data), 31):
@@ -239,13 +237,12 @@ def test_every_flipped_bit_of_a_diagnosis_is_found(cart, tmp_path):
         ended.adopt("viscous_friction:v")
 
 
-def test_a_diagnosis_without_a_checksum_is_not_adopted(cart, tmp_path):
-    folder = copied(cart, tmp_path / "w")
-    path = folder / "reports" / "diagnosis.json"
+def test_a_diagnosis_without_a_checksum_is_not_adopted(learnt):
+    path = learnt / "reports" / "diagnosis.json"
     text = path.read_text()
     path.write_text("{" + text.split(",", 1)[1])
     with pytest.raises(GroundedError, match=holding("diagnosis.json", "checksum")):
-        Workspace(folder).adopt("viscous_friction:v")
+        Workspace(learnt).adopt("viscous_friction:v")
 
 
 def test_a_deleted_trial_is_found_the_last_one_too(ended, which=-1):
@@ -269,7 +266,7 @@ def test_a_deleted_candidate_is_found_unless_a_trial_carries_it(ended):
 
 def test_joined_workspaces_never_mix_two_policies_of_one_name(ended, tmp_path):
     config = CONFIG.replace("max_trials", "refit = true\nmax_trials")  # the same task
-    other = learnt(tmp_path / "other", config=config)
+    other = searched(tmp_path / "other", config=config)
     assert other.task.hash == ended.task.hash
     assert other.candidate_bytes("c0002") != ended.candidate_bytes("c0002")
     before = ended.status()
