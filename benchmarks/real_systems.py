@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from types import ModuleType
 
 import numpy as np
@@ -13,13 +15,20 @@ from grounded.model import Model
 from grounded.trial import Trial
 from shared_data import data
 
+Run = tuple[np.ndarray, np.ndarray]  # states (T + 1, n), inputs (T, m)
+
 
 @dataclass(frozen=True)
 class RealSystem:
-    """A system: `text` is its model.py, `read` returns its trials."""
+    """A system: `text` is its model.py, `runs` yields its trials' states and inputs every dt [s].
+
+    rests: whether its inputs were 0 before each run; else the first ones were held.
+    """
 
     text: str
-    read: Callable[[], list[Trial]]
+    dt: float
+    runs: Callable[[], Iterable[Run]]
+    rests: bool = False
 
     @property
     def model(self) -> Model:
@@ -28,9 +37,23 @@ class RealSystem:
         exec(self.text, module.__dict__)
         return module.model
 
+    def read(self) -> list[Trial]:
+        """Return its trials."""
+        names = self.model.state_names, self.model.input_names
+        return [
+            Trial(x, u, self.dt, *names, start_inputs=np.zeros(u.shape[1]) if self.rests else u[0])
+            for x, u in self.runs()
+        ]
 
-def _emps() -> list[Trial]:
-    trials = []
+
+def _logged(folder: str, file: str) -> list[tuple[np.ndarray, np.ndarray | None]]:
+    """Return each run of a file, rows (T, columns), and their times."""
+    log = np.load(data(folder, f"{file}.npz"), allow_pickle=True)
+    names = sorted(name for name in log.files if re.fullmatch(r"run\d\d", name))
+    return [(log[name].astype(float), log.get(f"{name}_t")) for name in names]
+
+
+def _emps() -> Iterator[Run]:
     for name in ("emps_estimation", "emps_validation_pulses"):
         log = np.load(data("emps_prismatic_axis", f"{name}.npz"))
         q, u = log["q_m"], log["u_motor_V"]
@@ -38,51 +61,28 @@ def _emps() -> list[Trial]:
         v = np.gradient(smooth, 1e-3)
         n = (len(q) - 1) // 10
         states = np.stack([q[::10][: n + 1], v[::10][: n + 1]], axis=1)
-        inputs = u[: n * 10].reshape(n, 10).mean(axis=1)[:, None]
-        trials.append(Trial(states, inputs, 0.01, ("q", "v"), ("u",), start_inputs=inputs[0]))
-    return trials
+        yield states, u[: n * 10].reshape(n, 10).mean(axis=1)[:, None]
 
 
-def _servo() -> list[Trial]:
-    log = np.load(data("hobby_servo_real_and_sim_twin", "servo_real_sim.npz"))
-    trials = []
-    for i in range(32):
-        run = log[f"run{i:02d}"].astype(float)
-        names = (("position",), ("command",))
-        held = np.zeros(1)
-        trials.append(Trial(run[:, 1:2], run[:-1, :1], 0.02, *names, start_inputs=held))
-    return trials
+def _servo() -> Iterator[Run]:
+    for run, _ in _logged("hobby_servo_real_and_sim_twin", "servo_real_sim"):
+        yield run[:, 1:2], run[:-1, :1]
 
 
-def _dart_steered(name: str, most: int | None = None) -> Callable[[], list[Trial]]:
-    def read() -> list[Trial]:
-        log = np.load(data("dart_small_car", f"{name}.npz"), allow_pickle=True)
-        trials = []
-        for i in range(11):
-            run = log[f"run{i:02d}"].astype(float)
-            on = np.flatnonzero(run[:, 6] > 0)
-            run = run[on[0] + 8 : on[-1] - 4][:most] if len(on) else run[:0]
-            if len(run) >= 20:
-                u = run[:-1, [8, 5]]
-                names = (("w",), ("steering", "speed"))
-                trials.append(Trial(run[:, [4]], u, 0.1, *names, start_inputs=u[0]))
-        return trials
-
-    return read
+def _dart_steered(name: str, most: int | None = None) -> Iterator[Run]:
+    for run, _ in _logged("dart_small_car", name):
+        on = np.flatnonzero(run[:, 6] > 0)
+        run = run[on[0] + 8 : on[-1] - 4][:most] if len(on) else run[:0]
+        if len(run) >= 20:
+            yield run[:, [4]], run[:-1, [8, 5]]
 
 
-def _dart_throttle() -> list[Trial]:
-    log = np.load(data("dart_small_car", "throttle_steps_rubber_10Hz.npz"), allow_pickle=True)
-    trials = []
-    for i in range(26):
-        run = log[f"run{i:02d}"].astype(float)
-        if not 0.19 < run[:, 7].max() < 0.36:
-            continue
-        on = np.flatnonzero(run[:, 7] > 0.01)
-        run = run[max(on[0] - 5, 0) : on[-1]]
-        names = (("v",), ("throttle",))
-        trials.append(Trial(run[:, [5]], run[:-1, [7]], 0.1, *names, start_inputs=np.zeros(1)))
-    return trials
+def _dart_throttle() -> Iterator[Run]:
+    for run, _ in _logged("dart_small_car", "throttle_steps_rubber_10Hz"):
+        if 0.19 < run[:, 7].max() < 0.36:
+            on = np.flatnonzero(run[:, 7] > 0.01)
+            run = run[max(on[0] - 5, 0) : on[-1]]
+            yield run[:, [5]], run[:-1, [7]]
 
 
 def _resampled(t: np.ndarray, values: np.ndarray, dt: float, hold: bool = False) -> np.ndarray:
@@ -93,54 +93,27 @@ def _resampled(t: np.ndarray, values: np.ndarray, dt: float, hold: bool = False)
     return np.stack([np.interp(at, t, column) for column in values.T], axis=1)
 
 
-def _bam(speed: bool) -> Callable[[], list[Trial]]:
-    """Read the runs with motor volts as input whose torque was never switched off."""
+def _bam(inputs: str, speed: bool = True) -> Iterator[Run]:
+    """Yield runs with motor volts as input whose torque was never switched off.
 
-    def read() -> list[Trial]:
-        log = np.load(data("bam_xl330_servo", "bam_xl330_pendulum.npz"))
-        about = json.loads(data("bam_xl330_servo", "runs.json").read_text())
-        gain, trials = (4096 / (2 * np.pi)) / (256 * 885), []
-        for i, run in enumerate(about):
-            rows, t = log[f"run{i:02d}"].astype(float), log[f"run{i:02d}_t"]
-            if run["trajectory"] == "lift_and_drop":
-                continue
-            duty = np.clip((rows[:, 5] - rows[:, 0]) * run["kp"] * gain, -1, 1)
-            u = _resampled(t, (duty * run["vin"])[:, None], 0.01)
-            x = _resampled(t, rows[:, :2], 0.01)
-            x[:, 1] = x[:, 1] if speed else np.nan
-            names = (("q", "w"), ("volts",))
-            trials.append(Trial(x, u[:-1], 0.01, *names, start_inputs=u[0]))
-        return trials
-
-    return read
-
-
-def _bam_servo() -> list[Trial]:
-    """Read all runs with the servo's commands as inputs: goal, gain kp, torque_enable."""
-    log = np.load(data("bam_xl330_servo", "bam_xl330_pendulum.npz"))
+    Or all runs with the servo's commands as inputs: goal, gain kp, torque_enable.
+    """
     about = json.loads(data("bam_xl330_servo", "runs.json").read_text())
-    trials = []
-    for i, run in enumerate(about):
-        rows, t = log[f"run{i:02d}"].astype(float), log[f"run{i:02d}_t"]
+    gain = (4096 / (2 * np.pi)) / (256 * 885)
+    for run, (rows, t) in zip(about, _logged("bam_xl330_servo", "bam_xl330_pendulum"), strict=True):
         x, told = _resampled(t, rows[:, :2], 0.01), _resampled(t, rows[:, 5:7], 0.01, hold=True)
-        u = np.column_stack([told[:, 0], np.full(len(told), float(run["kp"])), told[:, 1]])
-        names = (("q", "w"), ("goal", "kp", "torque_enable"))
-        trials.append(Trial(x, u[:-1], 0.01, *names, start_inputs=u[0]))
-    return trials
+        if inputs == "commands":
+            kp = np.full(len(told), float(run["kp"]))
+            yield x, np.column_stack([told[:, 0], kp, told[:, 1]])[:-1]
+        elif run["trajectory"] != "lift_and_drop":
+            duty = np.clip((rows[:, 5] - rows[:, 0]) * run["kp"] * gain, -1, 1)
+            x[:, 1] = x[:, 1] if speed else np.nan
+            yield x, _resampled(t, (duty * run["vin"])[:, None], 0.01)[:-1]
 
 
-def _double(name: str, dt: float, most: int) -> Callable[[], list[Trial]]:
-    def read() -> list[Trial]:
-        log = np.load(data("dfki_double_pendulum", f"{name}.npz"), allow_pickle=True)
-        trials = []
-        for i in range(len(log["files"]))[:most]:
-            rows, t = log[f"run{i:02d}"].astype(float), log[f"run{i:02d}_t"]
-            x, u = _resampled(t, rows[:, :4], dt), _resampled(t, rows[:, 4:6], dt, hold=True)
-            names = (("q1", "q2", "w1", "w2"), ("tau1", "tau2"))
-            trials.append(Trial(x, u[:-1], dt, *names, start_inputs=u[0]))
-        return trials
-
-    return read
+def _double(name: str, dt: float, most: int) -> Iterator[Run]:
+    for rows, t in _logged("dfki_double_pendulum", name)[:most]:
+        yield _resampled(t, rows[:, :4], dt), _resampled(t, rows[:, 4:6], dt, hold=True)[:-1]
 
 
 # A motor and a ball screw without friction, 100 Hz (force averaged over a step).
@@ -156,6 +129,7 @@ model = Model(
     roles={"position": ("q",), "speed": "v"},
 )
 """,
+    0.01,
     _emps,
 )
 
@@ -171,7 +145,9 @@ model = Model(
     derivative=lambda s, a, p: {"position": (a.command - s.position) / p.tau},
 )
 """,
+    0.02,
     _servo,
+    rests=True,
 )
 
 # Heading rate proportional to speed and steering at once; slow runs, 10 Hz. (k by least squares.)
@@ -186,7 +162,8 @@ model = Model(
     step=lambda s, a, p, dt: {"w": p.k * a.speed * a.steering + 0 * s.w},
 )
 """,
-    _dart_steered("steering_sine_10Hz"),
+    0.1,
+    partial(_dart_steered, "steering_sine_10Hz"),
 )
 
 # A linear motor; straight runs at one throttle each, 10 Hz.
@@ -202,10 +179,12 @@ model = Model(
     roles={"speed": "v"},
 )
 """,
+    0.1,
     _dart_throttle,
+    rests=True,
 )
 
-DART_STEPS = RealSystem(DART_STEERING.text, _dart_steered("steering_steps_10Hz", 600))
+DART_STEPS = RealSystem(DART_STEERING.text, 0.1, partial(_dart_steered, "steering_steps_10Hz", 600))
 
 # A geared motor with back electromotive force that swings a mass; no friction.
 _BAM_TEXT = """import numpy as np
@@ -235,8 +214,8 @@ model = Model(
     substeps=2,
 )
 """
-BAM_Q = RealSystem(_BAM_TEXT, _bam(speed=False))
-BAM_QW = RealSystem(_BAM_TEXT, _bam(speed=True))
+BAM_Q = RealSystem(_BAM_TEXT, 0.01, partial(_bam, "volts", speed=False))
+BAM_QW = RealSystem(_BAM_TEXT, 0.01, partial(_bam, "volts"))
 
 # The same as a position servo, its goal in place of the volts; without torque its motor is open.
 BAM_KP = RealSystem(
@@ -245,7 +224,8 @@ BAM_KP = RealSystem(
         "    duty = np.clip((a.goal - s.q) * a.kp * 4096 / (2 * np.pi) / (256 * 885), -1, 1)\n"
         "    torque = a.torque_enable * p.kt / p.R * (7.4 * duty - p.kt * s.w)\n",
     ).replace('{"volts": "V"}', '{"goal": "rad", "kp": "1", "torque_enable": "1"}'),
-    _bam_servo,
+    0.01,
+    partial(_bam, "commands"),
 )
 
 # Two links, relative elbow angle, no friction; numbers of the authors' model 1.0 of design C.1.
@@ -287,5 +267,5 @@ model = Model(
     substeps=2,
 )
 """
-ACROBOT = RealSystem(_DOUBLE_TEXT, _double("acrobot_mcpilco", 0.03, 10))
-SYSID = RealSystem(_DOUBLE_TEXT, _double("sysid_C1", 0.01, 8))
+ACROBOT = RealSystem(_DOUBLE_TEXT, 0.03, partial(_double, "acrobot_mcpilco", 0.03, 10))
+SYSID = RealSystem(_DOUBLE_TEXT, 0.01, partial(_double, "sysid_C1", 0.01, 8))
