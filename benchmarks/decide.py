@@ -18,7 +18,7 @@ import pickle
 from pathlib import Path
 
 import grounded.diagnosis.diagnose as diagnosing
-from grounded.challenge import KINDS, judge, make, of_crude, oracle, task_of
+from grounded.challenge import KINDS, judge, make, of_crude, oracle
 from grounded.challenge.score import share
 from grounded.diagnosis.validation import choose
 from grounded.diagnosis.validation.decide import Options, decide
@@ -41,7 +41,7 @@ def fitted(case):
 
     diagnosing.decide = watched
     try:
-        document = diagnosing.diagnose(task_of(case), case.trials).to_json()
+        document = diagnosing.diagnose(case.task, case.trials).to_json()
     finally:
         diagnosing.decide = decide
     options = Options(kept["search"], kept["ruler"])
@@ -56,8 +56,8 @@ def fitted(case):
     nats = {(a.causes, b.causes): options.nats(a, b) for a, b in pairs}
     none = known[frozenset()]
     alone = {one.causes: options.nats(none, one) for one in [*known.values(), *less.values()]}
-    label = of_crude(case.label, case.model)
-    true = oracle(case.model, case.trials, case.latency, label)
+    label = of_crude(case.label, case.task.model)
+    true = oracle(case.task.model, case.trials, case.task.latency, label)
     ruler = kept["ruler"]
     return {
         "options": list(known.values()), "less": less, "nats": nats, "alone": alone,

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
 from grounded.challenge.mechanism import simulator
-from grounded.challenge.score import Oracle, judge, of_crude, oracle, summary, task_of
+from grounded.challenge.score import Oracle, judge, of_crude, oracle, summary
 
 __all__ = [
     "KINDS",
@@ -26,5 +26,4 @@ __all__ = [
     "sealed",
     "simulator",
     "summary",
-    "task_of",
 ]

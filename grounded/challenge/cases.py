@@ -24,7 +24,9 @@ from grounded.checks import known
 from grounded.effects import Effect, ParamFamily, scales_of
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.task import Task
 from grounded.trial import Trial
+from grounded.utility import Reward
 
 Kind = Literal["single", "double", "none", "withheld"]
 KINDS: tuple[Kind, ...] = ("single", "double", "none", "withheld")
@@ -33,19 +35,12 @@ NOISE_KINDS = ("white", "coloured", "heavy")
 
 @dataclass(frozen=True, eq=False)
 class Case:
-    """One case. `model` is the crude model that the user has; `label` is sealed."""
+    """One case. `task` is what the user has, with the crude model; `label` is sealed."""
 
     name: str
     system: str
-    model: Model
+    task: Task
     trials: tuple[Trial, ...]
-    fresh: tuple[Trial, ...]  # further trials of the same system, for scoring predictions
-    dt: float
-    target: Array  # (T + 1, n)
-    start: Array
-    low: Array
-    high: Array
-    latency: Array  # (m,) [s]
     label: Mapping[str, Any] = field(default_factory=dict)
 
 
@@ -155,25 +150,25 @@ def _case(
         grows=system.grows,
     )
     truth, label = _truth(kind, system, plans, setting, disturbance, rng)
+    # the last two runs are in no case, but the numbers drawn for them are in the seeds of all sets
     runs = [_run(system, truth, plan, setting, rng) for plan in plans]
     if system.built and any(map(partial(_lost, crude), runs, plans)):
         return None
     label |= {"noise": setting.kind, "level": setting.level, "roughness": setting.roughness}
     label |= {"param_error": error, "system": system.name, "kind": kind, "case": name}
-    return Case(
-        name=name,
-        system=system.name,
+    ones, none = np.ones(crude.n), np.zeros(crude.m)
+    task = Task(
         model=crude,
-        trials=tuple(runs[: setting.trials]),
-        fresh=tuple(runs[setting.trials :]),
         dt=dt,
         target=plans[0][2],
+        reward=Reward(ones, 0 * ones, none, none),
         start=plans[0][1],
+        past=none,
         low=system.low,
         high=system.high,
-        latency=np.array(system.latency or (0.0,) * system.model.m),
-        label=label,
+        latency=np.array(system.latency or none),
     )
+    return Case(name, system.name, task, tuple(runs[: setting.trials]), label)
 
 
 def _with_errors(model: Model, error: float, rng: np.random.Generator) -> Model:

@@ -21,16 +21,13 @@ from typing import Any
 import numpy as np
 
 from grounded.challenge import systems
-from grounded.challenge.cases import Case
 from grounded.diagnosis.hypotheses.search import HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Library
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.task import Task
 from grounded.trial import Trial
-from grounded.utility import Reward
 
 Marks = Sequence[Mapping[str, Any]]
 DETECTABLE = 3.0  # nats
@@ -264,19 +261,3 @@ def share(said: Iterable[bool]) -> dict[str, Any]:
     half = z / (n + z**2) * float(np.sqrt(k * (n - k) / n + z**2 / 4))
     interval = [max(middle - half, 0.0), min(middle + half, 1.0)]
     return {"count": k, "of": n, "share": k / n, "interval": interval}
-
-
-def task_of(case: Case) -> Task:
-    """Return the task of a case as its user has it: crude model, latency, limits."""
-    n, m = case.model.n, case.model.m
-    return Task(
-        model=case.model,
-        dt=case.dt,
-        target=case.target,
-        reward=Reward(np.ones(n), np.zeros(n), np.zeros(m), np.zeros(m)),
-        start=case.start,
-        past=np.zeros(m),
-        low=case.low,
-        high=case.high,
-        latency=case.latency,
-    )

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.challenge import Case, judge, of_crude, oracle, sealed, task_of
+from grounded.challenge import Case, judge, of_crude, oracle, sealed
 from grounded.checks import refused, wrong
 from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.effects import Library
@@ -89,12 +89,12 @@ def _write_case(case: Case, folder: Path) -> list[str]:
     if stored != [digest[:DIGITS] for digest in hashes[: len(stored)]]:
         raise refused("file.exists", folder / "trials")
     made_folder(folder)
-    task, names = task_of(case), case.model.state_names
-    columns = {name: case.target[:, i] for i, name in enumerate(names)}
-    write_target(folder / "target.csv", case.dt, columns)
+    task, model = case.task, case.task.model
+    columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
+    write_target(folder / "target.csv", task.dt, columns)
     values = ", ".join(
         f"{name} = {float(value)!r}"
-        for name, value in zip(case.model.param_names, case.model.values, strict=True)
+        for name, value in zip(model.param_names, model.values, strict=True)
     )
     lines = toml_of(task, case.name).split("\n")
     at = next(i for i, line in enumerate(lines) if line.startswith("file ="))

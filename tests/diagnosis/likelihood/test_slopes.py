@@ -85,7 +85,7 @@ def test_the_slopes_of_the_noise_are_those_of_the_likelihood(tau):
 @pytest.fixture(scope="module")
 def cars():
     case = next(iter(make("none", 1, 17, only="car")))
-    return case, prepare(case.model, case.trials, case.latency)
+    return case, prepare(case.task.model, case.trials, case.task.latency)
 
 
 def effect(data, name):
@@ -164,7 +164,7 @@ def test_a_carried_heading_rate_is_limited_with_the_heading(cars):
 
 def test_a_threshold_of_the_model_has_a_slope(cars):
     case, data = cars
-    model = case.model
+    model = case.task.model
     x = np.tile([0.0, 0.1, 0.0, 0.0, 0.0, 0.0], (9, 1))
     u = np.column_stack([np.zeros(9), np.linspace(0.16, 0.2, 9)])  # around the stall
     _, _, f_p = sensitivities(model, x, u, model.values, data.dt)
