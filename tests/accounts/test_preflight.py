@@ -1,6 +1,7 @@
 """The instruments, judged from their own signals: known faults of generated ones, real ones."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from grounded import Model, Param, Trial
 from grounded.accounts.lag import at_samples
 from grounded.accounts.sound_trials import sound_trials as preflight
 from grounded.errors import GroundedError, NextCommand
+from stepped import logged, stepped
 
 DT = 0.02
 ARM = Model(
@@ -19,21 +21,16 @@ ARM = Model(
 )
 
 
-def arm(fault=lambda x: x, seed=0, trials=4, steps=200, friction=0.0):
+FINE = replace(ARM, substeps=4)
+
+
+def arm(fault=lambda x: x, seed=0, trials=4, steps=200):
     """Trials of an arm whose noisy sensors have a fault: (T + 1, 2) -> (T + 1, 2)."""
-    rng, found = np.random.default_rng(seed), []
+    rng, found, t = np.random.default_rng(seed), [], np.arange(steps) * DT
     for _ in range(trials):
-        t = np.arange(steps) * DT
         u = 2 * np.sin(rng.uniform(1, 4) * t + rng.uniform(0, 6)) + np.sin(rng.uniform(4, 9) * t)
-        states = [np.zeros(2)]
-        for k in range(steps):
-            z = states[-1]
-            for _ in range(4):
-                push = u[k] - friction * np.tanh(z[1] / 0.02)
-                z = ARM.system.step(z[None], np.array([[push]]), ARM.values, DT / 4)[0]
-            states.append(z)
-        y = np.array(states) + rng.standard_normal((steps + 1, 2)) * [1e-3, 1e-2]
-        found.append(Trial(fault(y), u[:, None], DT, ("q", "w"), ("u",)))
+        run = logged(ARM, stepped(FINE, u, DT), u, DT, [1e-3, 1e-2], rng)
+        found.append(replace(run, states=fault(run.states)))
     return found
 
 
@@ -156,12 +153,9 @@ def test_an_angle_in_degrees_in_all_logs_is_told_by_the_model(unit, sent, k):
     """Ball on a beam: no rate of theta is logged, only its command and what it does to the ball."""
     rng, trials = np.random.default_rng(1), []
     for phase in (0.0, 2.0):
-        u, states = 0.12 * np.sin(1.8 * DT * np.arange(400) + phase)[:, None], [np.zeros(3)]
-        for one in u:
-            real = np.array([k, 0.13])
-            states.append(BEAM.system.step(states[-1][None], one[None], real, DT)[0])
-        x = np.array(states) + rng.normal(size=(401, 3)) * [1e-3, 4e-3, 1e-3]
-        trials.append(Trial(x * [1, 1, unit], sent * u, DT, BEAM.state_names, ("cmd",)))
+        u = 0.12 * np.sin(1.8 * DT * np.arange(400) + phase)
+        x = stepped(BEAM.with_values({"k": k, "tau": 0.13}), u, DT) * [1, 1, unit]
+        trials.append(logged(BEAM, x, sent * u, DT, [1e-3, 4e-3, 1e-3 * unit], rng))
     found = [(f.signal, f.kind) for f in preflight(BEAM, trials).findings]
     assert found == [("theta", "degrees")] * (unit > 1) + [("cmd", "degrees")] * (sent > 1)
 
