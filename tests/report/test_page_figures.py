@@ -31,6 +31,7 @@ from grounded_trials.wording import percent
 from grounded_trials.workspace.adopted import planner_of
 from reported import gathered, many_flights
 from small_tasks import cart, cart_task
+from stepped import logged, stepped
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
 FIGURES += ("forecast", "residual")
@@ -259,12 +260,10 @@ DELAY = 2  # steps by which x is logged late
 
 def _logged(task, drag):
     """A run of the cart with another drag, its place logged late."""
-    inputs = np.sin(np.arange(40) / 4)[:, None]
-    states, p = np.zeros((41, 2)), cart.with_values({"drag": drag}).values
-    for t in range(40):
-        states[t + 1] = cart.system.step(states[t][None], inputs[t][None], p, task.dt)[0]
-    late = np.r_[np.zeros(DELAY), states[:-DELAY, 0]]
-    return Trial(np.column_stack([late, states[:, 1]]), inputs, task.dt, ("x", "v"), ("force",))
+    inputs = np.sin(np.arange(40) / 4)
+    x, v = stepped(cart.with_values({"drag": drag}), inputs, task.dt).T
+    late = np.r_[np.zeros(DELAY), x[:-DELAY]]
+    return logged(cart, np.column_stack([late, v]), inputs, task.dt)
 
 
 def test_a_late_log_is_not_taken_for_what_the_model_lacks():
