@@ -140,7 +140,10 @@ def ingest_log(
             from grounded_trials.workspace.intake.recognise import best_run_again
 
             read = best_run_again(workspace, path, error)
-    if not _as_logged(workspace, read):
+    # data, or commands that are the candidate's to the last digits: no other story is asked for;
+    # of a foreign log it must be found where the run begins
+    ran = read.trial.candidate
+    if ran and not (read.own and as_sent(workspace.candidate(ran)[0].policy, read.trial)):
         from grounded_trials.workspace.intake.recognise import recognised
 
         read = recognised(workspace, path, read, candidate)
@@ -150,23 +153,14 @@ def ingest_log(
     with ExitStack() as new:  # nothing is stored if judging the trial fails
         added = new.enter_context(workspace.store.adding(read.data, again=before != ""))
         if read.bare:  # record which candidate file it ran
-            ran = sha256(workspace.candidate_bytes(read.trial.candidate))
-            note = {"note": "run", "trial": added.sha256[:DIGITS], "sha256": ran}
+            policy = sha256(workspace.candidate_bytes(ran))
+            note = {"note": "run", "trial": added.sha256[:DIGITS], "sha256": policy}
             new.enter_context(workspace.notes.adding(note))
         if group:
             note = {"note": "group", "trial": added.sha256[:DIGITS], "group": group}
             new.enter_context(workspace.notes.adding(note, again=True))
         workspace.forget_trials()
         return _judged(workspace, read, added, before, ahead=ahead)
-
-
-def _as_logged(workspace: Folder, read: Read) -> bool:
-    """Return whether a trial is data, or its commands are its candidate's to the last digits.
-
-    No other story of it is asked for then. Of a foreign log it must be found where the run begins.
-    """
-    ran = read.trial.candidate
-    return not ran or (read.own and as_sent(workspace.candidate(ran)[0].policy, read.trial))
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
@@ -203,7 +197,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
     findings = settle([*told, *filter(None, shown)])
 
     # `status` can't tell from the trial alone that it was taken against its commands
-    if (why := read.to_set_aside) and not aside:
+    asked = (one for one in read.findings if one.weight is Weight.ASIDE)
+    if read.doubted and not aside and (why := next(asked, None)):
         note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": why.code}
         with suppress(GroundedError):  # a folder that can't be written
             workspace.notes.add(note, again=False)

@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,7 +36,6 @@ from grounded.accounts.sent import follows, latest
 from grounded.accounts.table import Account
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
-from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import Trial, interpolate_gaps
@@ -83,9 +83,9 @@ def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
     try:
         read = read_log_file(workspace, path, error.best, False)
         seen = recognised(workspace, path, read, None)
-    except OfEarlierTask:
-        raise
     except GroundedError as refused:
+        if refused.finding.code == "log.earlier":
+            raise
         raise GroundedError(str(error), refused.then) from None
     doubts = [one for one in seen.findings if one not in read.findings]  # where it begins, whose
     if any(one.weight is not Weight.NOTE for one in doubts):
@@ -111,7 +111,8 @@ class Case:
         self.own, _ = workspace.candidate(self.ran)
         # what may still be on the robot: of earlier tasks with as many steps as a run of this one
         candidates, earlier = latest_candidates(workspace, OTHERS)
-        self.earlier = [one for one in earlier if _like_task(one.policy, self.task)]
+        shape = attrgetter("dt", "horizon", "state_names", "input_names")
+        self.earlier = [one for one in earlier if shape(one.policy) == shape(self.own.policy)]
         self.rivals, self.exact = [*self.earlier, *candidates], False
         self.found: Start | None = None
         # set if judged on other samples than stored
@@ -421,25 +422,11 @@ def _lasting_s(log: Recording) -> float:
     return 1e-9 * (end - log.whole.origin_ns) - log.first
 
 
-def _like_task(policy: Policy, task: Task) -> bool:
-    """Return whether a policy has the steps, states and inputs of a task."""
-    names = (task.model.state_names, task.model.input_names)
-    return (policy.dt, policy.horizon, policy.state_names, policy.input_names) == (
-        task.dt,
-        task.horizon,
-        *names,
-    )
-
-
-class OfEarlierTask(GroundedError):
-    """Raised for a log that ran a candidate of an earlier task."""
-
-
-def _of_earlier(workspace: Folder, path: str, ran: str) -> OfEarlierTask:
+def _of_earlier(workspace: Folder, path: str, ran: str) -> GroundedError:
     """Return the error of a log that a candidate of an earlier task ran."""
     was = other_task(workspace.task, workspace.candidate(ran)[0])
     told = found("log.earlier", path, ran=ran, was=was)
-    return OfEarlierTask(told, NextCommand("ingest", (path, "--data")))
+    return GroundedError(told, NextCommand("ingest", (path, "--data")))
 
 
 def of_earlier_task(workspace: Folder, log: Recording | None, trial: Trial) -> Story | None:

@@ -19,7 +19,6 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found
 from grounded.model import Model
 from grounded.places import integrals
-from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_files import kind_of, log_records, read_apart
@@ -50,16 +49,12 @@ from grounded_trials.workspace.intake.opening.reading import (
     outstanding,
 )
 from grounded_trials.workspace.intake.opening.run_start import Recording, recording
-from grounded_trials.workspace.intake.opening.stored_before import (
-    refuse_as_another,
-    set_aside_of,
-)
+from grounded_trials.workspace.intake.opening.stored_before import refuse_as_another
 from grounded_trials.workspace.readings import read_by, twice_in_time
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.where_to_mend import hashed
 
 SLOWER = 1.5  # commands with intervals above this multiple of dt were sent on another grid
-SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
 EARLY_SHARE = 0.002  # of a control step, by which interpolated states may be early
 SIGNALS_LISTED = 12  # largest number of a log's signals that a message lists
 
@@ -115,16 +110,6 @@ class ForeignLog:
         )
         return trial, found
 
-    def silent_from(self, ns: int) -> tuple[str, ...]:
-        """Return the states without a value from a time [ns] on, if others have some then."""
-        last = {
-            name: int(one.t[np.isfinite(one.values)].max(initial=0))
-            for name, one in self.series.items()
-        }
-        least, states = ns + round(1e9 * SILENT_S), self.workspace.base_model.states
-        on = any(end > least for end in last.values())
-        return tuple(name for name, end in last.items() if on and end < least and name in states)
-
     def refuse_late(self, grid: Gridded) -> None:
         """Refuse a candidate's run if its beginning was not recorded.
 
@@ -170,15 +155,6 @@ class ForeignLog:
         trials = self.workspace.whole_trials()
         return tuple(one for one in trials if one.meta.get(key) == self.source[key])
 
-    @cached_property
-    def _estimating(self) -> Task:
-        """The task with the model that is used to estimate states."""
-        effects = self.workspace.config.model.effects
-        kept = but_late_sensors(effects)
-        if len(kept) == len(effects):
-            return self.workspace.planner.plan
-        return planner_of(self.workspace.task, kept).plan
-
     @property
     def _beside(self) -> tuple[str, ...]:
         """States that are mapped in [log] but not listed in [estimate] measured."""
@@ -197,8 +173,11 @@ class ForeignLog:
         """The samples of every state and input, also of estimated states."""
         if not self.estimate:
             return self.series
-        names = self.workspace.base_model.state_names
-        return {**with_estimates(self.series, self.estimate, self._estimating, names), **self.own}
+        here, effects = self.workspace, self.workspace.config.model.effects
+        kept = but_late_sensors(effects)
+        planner = here.planner if len(kept) == len(effects) else planner_of(here.task, kept)
+        names = here.base_model.state_names
+        return {**with_estimates(self.series, self.estimate, planner.plan, names), **self.own}
 
     @cached_property
     def as_seen(self) -> ForeignLog | None:
@@ -349,7 +328,10 @@ def read_log_file(
     log = read_foreign(workspace, path, mapping_of(workspace, path).since(sent_before))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(workspace, path, log.stored, "" if data else candidate)
-    before = None if data or ran else set_aside_of(workspace, log.source["source_sha256"])
+    # the last trial, among those set aside, that was made from this log
+    aside = () if data or ran else workspace.aside_trials()
+    made = [t for t in aside if t.meta.get("source_sha256") == log.source["source_sha256"]]
+    before = made[-1] if made else None
     if before and before.trial.candidate in workspace.candidate_ids():
         ran = before.trial.candidate
     chosen = "" if data else ran or outstanding(workspace, path)

@@ -13,9 +13,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError
-from grounded.findings import Finding, Weight
+from grounded.findings import Finding
 from grounded.trial import Trial
 from grounded.units import same_unit
 from grounded_trials.plain_file import read_file
@@ -34,6 +36,9 @@ if TYPE_CHECKING:
     from grounded_trials.logs.resample import Gridded
     from grounded_trials.logs.signal_report import SignalReport
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
+
+
+SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,18 +75,14 @@ class Read:
         return 1e-9 * (self.cut.last_ns - self.cut.start_ns) if self.cut else math.nan
 
     @property
-    def to_set_aside(self) -> Finding | None:
-        """Why a log that ran no candidate as it should, taken as its run, is to be set aside."""
-        asked = (one for one in self.findings if one.weight is Weight.ASIDE)
-        return next(asked, None) if self.doubted else None
-
-    @property
     def silent(self) -> tuple[str, ...]:
         """The states without a value from the end of the trial on, though its log goes on."""
         if self.log is None or self.cut is None:
             return ()
-        ends = self.cut.start_ns + round(1e9 * self.trial.steps * self.trial.dt)
-        return self.log.silent_from(ends)
+        ends = self.cut.start_ns + round(1e9 * (self.trial.steps * self.trial.dt + SILENT_S))
+        known = {n: one.t[np.isfinite(one.values)] for n, one in self.log.series.items()}
+        gone = [n for n, t in known.items() if t.max(initial=0) < ends]
+        return tuple(n for n in gone if len(gone) < len(known) and n in self.trial.state_names)
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:

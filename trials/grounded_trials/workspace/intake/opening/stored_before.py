@@ -60,12 +60,6 @@ def refuse_as_another(
     raise refused("log.stored", path, trial=identity, then=then, used=ran[-1] or "data", **facts)
 
 
-def set_aside_of(workspace: Folder, digest: str) -> StoredTrial | None:
-    """Return the last trial, among those set aside, that was made from a log with this hash."""
-    made = [one for one in workspace.aside_trials() if one.meta.get("source_sha256") == digest]
-    return made[-1] if made else None
-
-
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
     """Return the stored file of a log's trial if it is stored, else the new one.
 
