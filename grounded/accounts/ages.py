@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -100,7 +100,9 @@ class Ages:
                 continue
             lag = lag_of(self.model, relation, self.trials)
             clear = lag if lag is not None and lag.coherence > NEARLY_ALL else None
-            if clear and (found := self.derived(relation, clear)):
+            # a difference over one step is half a step late
+            behind = clear and relation.exact and clear.sign > 0 and clear.delay >= self.dt / 2
+            if clear and behind and (found := derived(self.model, relation, self.trials, self.dt)):
                 if not adopted:
                     yield from self.late(relation, clear)
                 yield self.filtered(relation, found)
@@ -185,23 +187,17 @@ class Ages:
         said = found_("sensor.late", name, by=_size(d, lag), **follows)
         return Finding(name, said, "delay", keys={"delay_s": float(f"{d:.3g}")}, **times)
 
-    def derived(self, relation: Integral, lag: Lag) -> Derived | None:
-        """Return how a late velocity follows from its position, if it does."""
-        if not relation.exact or lag.sign < 0 or lag.delay < 0.5 * self.dt:
-            return None  # a difference over one step is half a step late
-        return derived(self.model, relation, self.trials, self.dt)
-
-    def filtered(self, relation: Integral, found: Derived) -> Finding:
+    def filtered(self, relation: Integral, found: tuple[float, float, float]) -> Finding:
         """Drop a velocity that is computed from its position, to which it adds nothing.
 
         Around a stop it is wrong for as long as it averages.
         """
-        q, w = (self.names[k] for k in (relation.i, relation.j))
-        if abs(found.gain - 1) + SURELY * found.gain_std < SLIGHT:
+        (gain, std, age), (q, w) = found, (self.names[k] for k in (relation.i, relation.j))
+        if abs(gain - 1) + SURELY * std < SLIGHT:
             self.rule_out(q, w)
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
         self.shown.remove(relation.j)
-        said = found_("sensor.derived", w, of=q, age=found.age)
+        said = found_("sensor.derived", w, of=q, age=age)
         return Finding(w, said, "smoothed", corrected=True, source=q)
 
     def constant(self, relation: Integral) -> Iterator[Finding]:
@@ -278,24 +274,13 @@ def own_lag(model: Model, relation: Integral, trials: Sequence[Trial]) -> float:
     return late if np.isfinite(late) and abs(late) < dt else 0.0
 
 
-class Derived(NamedTuple):
-    """The weights of past differences of a position in a velocity, summarised.
-
-    Attributes:
-        gain: their sum.
-        gain_std: its standard deviation.
-        age: their mean age [s].
-    """
-
-    gain: float
-    gain_std: float
-    age: float
-
-
 def derived(
     model: Model, relation: Integral, trials: Sequence[Trial], least: float
-) -> Derived | None:
+) -> tuple[float, float, float] | None:
     """Return how a velocity follows from its position through a causal filter.
+
+    That is the sum of the weights of the position's differences, its standard deviation, and their
+    mean age [s].
 
     Args:
         model: with this relation.
@@ -334,7 +319,7 @@ def derived(
     wide, std = 12 * float(weights @ apart), 12 * float(np.sqrt(apart @ covariance @ apart))
     if wide - SURELY * std < least**2:  # of the plain mean with this variance of ages
         return None
-    return Derived(gain, float(np.sqrt(covariance.sum())), age)
+    return gain, float(np.sqrt(covariance.sum())), age
 
 
 def bias_of(

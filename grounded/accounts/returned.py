@@ -27,6 +27,7 @@ from grounded.accounts.levels import (
     HALF,
     LATEST,
     MARGIN,
+    NEARLY_ALL,
     PART,
     SLIGHT,
     STEPS_TO_JUDGE,
@@ -41,6 +42,7 @@ from grounded.accounts.sent import (
     evidence,
     follows,
     latest,
+    past_of,
 )
 from grounded.accounts.table import Account, of_commands, unit_named
 from grounded.findings import Finding, Quantity, found
@@ -143,13 +145,6 @@ class Row(NamedTuple):
     steps: int = 0
 
 
-def multiplied(trial: Trial, names: Sequence[str], factor: float) -> Trial:
-    """Return a trial with some columns multiplied by a factor."""
-    every = (*trial.state_names, *trial.input_names)
-    columns = tuple(every.index(name) for name in names)
-    return Account("unit", columns, 1 / factor).mended(trial) if columns else trial
-
-
 def filtered(x: Array, shares: Array) -> Array:
     """Return states (T, n) that a first-order filter passed on, (K, T, n) for its K shares."""
     found = np.repeat(x[None], len(shares), axis=0)
@@ -184,7 +179,7 @@ def stories(
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
-    rows = nearest(rows_of(task, own, trial, logged, waits))
+    rows = nearest(_Table(task.model, own, trial, logged).rows(waits))
     some = [one for row in rows for one in stories_of(row, task, own, trial, plain)]
     return sorted(some, key=lambda one: one.left)
 
@@ -223,10 +218,10 @@ def nearest(rows: Sequence[Row]) -> list[Row]:
         groups.setdefault(id(row.policy), []).append(k)
     for some in groups.values():
         policy, runs = rows[some[0]].policy, [rows[k].run for k in some]
-        T, past = min(runs[0].steps, policy.horizon), runs[0].start_inputs
+        T, past = min(runs[0].steps, policy.horizon), past_of(policy, runs[0])
         sent = np.clip(np.stack([run.inputs[:T] for run in runs]), policy.low, policy.high)
         states = np.stack([run.states[:T] for run in runs])
-        asked = policy.commands(states, policy.past if past is None else past)
+        asked = policy.commands(states, past)
         size = np.maximum(np.abs(asked).max(axis=1), np.abs(sent).max(axis=1)) + 1e-12
         square = (((asked - sent) / size[:, None]) ** 2).mean(axis=2)
         left = np.sqrt(np.median(square, axis=1) + 1e-3 * square.mean(axis=1))
@@ -238,118 +233,259 @@ def nearest(rows: Sequence[Row]) -> list[Row]:
 # --- the table ------------------------------------------------------------------------------------
 
 
-def rows_of(
-    task: Task,
-    own: Ran,
-    trial: Trial,
-    logged: Sequence[str],
-    waits: bool | None,
-) -> list[Row]:
-    """Return the table: rows that hold for any trial, and those with a number that is fitted.
+class _Table:
+    """The rows of a trial: those that hold for any, and those with a number that is fitted.
 
     Args:
-        task: the task of the candidate.
-        own: the candidate.
+        model: of the task.
+        own: the candidate that it is said to have run.
         trial: the trial, not longer than its run.
         logged: the states that a column holds.
-        waits: whether its log begins before any run; None if that is unknown.
     """
-    scales, fed = [*_scales(task.model, own, trial, logged)], own.policy.gain is not None
-    some = [*scales, *_orders(task.model, own, trial, logged)]
-    some += _times(own, trial)
-    if fed:
-        some += _fitted(task.model, own, trial, scales, logged)
-        some += _smoothed(task.model, own, trial)
-    some += _clipped(own, trial)
-    return [*some, *(_held(own, trial) if waits is None else _later(own, trial, waits))]
 
+    def __init__(self, model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> None:
+        self.model, self.own, self.policy, self.trial = model, own, own.policy, trial
+        self.logged, self.names = logged, (*model.state_names, *model.input_names)
+        self.fed = own.policy.gain is not None
 
-def _passed(
-    code: str, own: Ran, price: float = MARGIN, names: Sequence[str] = (), **facts: Any
-) -> Story:
-    """Return the story that the robot's program gave its policy something else, or ran it so."""
-    told = found(code, ran=own.id, **facts)
-    return Story(Kind.PROGRAM, told, price=price, names=tuple(names), by=facts.get("times", 1.0))
+    def rows(self, waits: bool | None) -> list[Row]:
+        """Return all rows.
 
+        Args:
+            waits: whether its log begins before any run; None if that is unknown.
+        """
+        scales = [*self.scales()]
+        some = [*scales, *self.orders(), *self.times()]
+        if self.fed:
+            some += [*self.fitted(scales), *self.smoothed()]
+        return [*some, *self.clipped(), *(self.held() if waits is None else self.later(waits))]
 
-def _scales(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
-    """Yield columns in another unit or of the other sign: of the log, or as a program passed them.
+    def passed(
+        self, code: str, price: float = MARGIN, names: Sequence[str] = (), **facts: Any
+    ) -> Story:
+        """Return the story that the program gave its policy something else, or ran it so."""
+        told = found(code, ran=self.own.id, **facts)
+        return Story(Kind.PROGRAM, told, price=price, names=tuple(names))
 
-    At the limits one state may explain as much as all, but a program passes all in one unit.
-    """
-    fed = own.policy.gain is not None
-    names, guessed = (*model.state_names, *model.input_names), {*model.state_names} - {*logged}
-    for one in of_commands(model, trial.inputs):
-        group, by = tuple(names[k] for k in one.columns), 1 / one.factor
-        some = [Story(Kind.UNIT, price=one.price, names=group, by=by)] * bool({*group} - guessed)
-        if max(one.columns) < model.n and fed:
-            unit = unit_named((model.states[n] for n in group), by)
-            how: dict[str, Any] = {"unit": unit} if unit else {"times": by}
-            price, how = MARGIN * (1 - len(group) / model.n), how | {"order": model.state_names}
-            some.append(
-                replace(_passed("run.passed", own, price, group, states=group, **how), by=by)
-            )
-        if some:
-            yield Row(own.policy, one.mended(trial), tuple(some))
+    def scales(self) -> Iterator[Row]:
+        """Yield columns in another unit or of the other sign: of the log, or as they were passed.
 
+        At the limits one state may explain as much as all, but a program passes all in one unit.
+        """
+        model, guessed = self.model, {*self.model.state_names} - {*self.logged}
+        for one in of_commands(model, self.trial.inputs):
+            group, by = tuple(self.names[k] for k in one.columns), 1 / one.factor
+            some = [Story(Kind.UNIT, price=one.price, names=group, by=by)]
+            some = some if {*group} - guessed else []
+            if max(one.columns) < model.n and self.fed:
+                unit = unit_named((model.states[n] for n in group), by)
+                how: dict[str, Any] = {"unit": unit} if unit else {"times": by}
+                how |= {"states": group, "order": model.state_names}
+                price = MARGIN * (1 - len(group) / model.n)
+                some.append(replace(self.passed("run.passed", price, group, **how), by=by))
+            if some:
+                yield Row(self.policy, one.mended(self.trial), tuple(some))
 
-def unit_by_factor(model: Model, names: Sequence[str], by: float) -> str:
-    """Return the unit of signals in a log that a factor converts to the model's; "" if unknown."""
-    own = {**model.states, **model.inputs}
-    return unit_named((own[name] for name in names), 1 / by) if names else ""
+    def orders(self) -> Iterator[Row]:
+        """Yield wrong orders that occur: two exchanged, some of the first ones last, sorted.
 
+        A program has positions before velocities where the model has them after, for example; a log
+        has two columns in each other's place.
+        """
+        n, m, right = self.model.n, self.model.m, self.model.state_names
+        for some in (range(n) if self.fed else (), range(n, n + m)):
+            for a, b in combinations(some, 2):
+                names = (self.names[a], self.names[b])
+                told = found("log.exchange", *names, ran=self.own.id)
+                log = Story(Kind.LOG, told, names=names, price=MARGIN)
+                both = [log] if a >= n or {*names} <= {*self.logged} else []
+                if a < n:
+                    both.append(self.misordered([{a: b, b: a}.get(k, k) for k in range(n)]))
+                run = Account("exchange", pairs=((a, b),)).mended(self.trial)
+                yield Row(self.policy, run, tuple(both))
+        ways = [[*range(k, n), *range(k)] for k in range(1, n)]
+        ways.append(sorted(range(n), key=lambda k: right[k]))
+        for order in ways if self.fed else ():
+            if sum(k != at for at, k in enumerate(order)) > 2:
+                run = replace(self.trial, states=self.trial.states[:, order])
+                yield Row(self.policy, run, (self.misordered(order),))
 
-def _orders(model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> Iterator[Row]:
-    """Yield wrong orders that occur: two exchanged, some of the first ones last, sorted.
+    def misordered(self, order: Sequence[int]) -> Story:
+        """Return the story that a program passed the states in this order."""
+        right = self.model.state_names
+        passed = tuple(right[k] for k in order)
+        moved = [name for name, now in zip(right, passed, strict=True) if name != now]
+        price = MARGIN * (1 - len(moved) / self.model.n)
+        return self.passed("run.passed", price, moved, passed=passed, order=right)
 
-    A program has positions before velocities where the model has them after, for example; a log has
-    two columns in each other's place.
-    """
-    right, n = model.state_names, model.n
-    every = (*right, *model.input_names)
-    for some in (right if own.policy.gain is not None else (), model.input_names):
-        first = every.index(some[0]) if some else 0
-        for pair in combinations(some, 2):
-            a, b = (every.index(name) for name in pair)
-            run = Account("exchange", pairs=((a, b),)).mended(trial)
-            log = Story(
-                Kind.LOG, found("log.exchange", *pair, ran=own.id), names=pair, price=MARGIN
-            )
-            told = [log] if first == n or {*pair} <= {*logged} else []
-            if first < n:
-                order = tuple({a: b, b: a}.get(k, k) for k in range(n))
-                told.append(_misordered(model, own, order))
-            yield Row(own.policy, run, tuple(told))
-        ways = [(*range(k, n), *range(k)) for k in range(1, n)] if first < n else []
-        ways += [tuple(sorted(range(n), key=lambda k: right[k]))] if first < n else []
-        for order in dict.fromkeys(one for one in ways if _moves(one) > 2):
-            run = replace(trial, states=trial.states[:, order])
-            yield Row(own.policy, run, (_misordered(model, own, order),))
+    def times(self) -> Iterator[Row]:
+        """Yield the policy at other times than the run's, and without its feedback."""
+        unsent = np.abs(self.trial.inputs - self.policy.past).max() <= 1e-9
+        for unit, factor in TIMES.items():
+            if unsent or np.isfinite(factor):
+                story = self.passed("run.passed", time=unit)
+                yield Row(_at_times(self.policy, factor), self.trial, (story,))
+        if self.fed:
+            alone = replace(self.policy, gain=None, reference=None)
+            yield Row(alone, self.trial, (self.passed("run.unfed"),))
 
+    def fitted(self, known: Sequence[Row]) -> Iterator[Row]:
+        """Yield columns times the factor, and states from the zero, that fit the commands best.
 
-def _moves(order: Sequence[int]) -> int:
-    return sum(k != at for at, k in enumerate(order))
+        A policy is linear in what it is fed: columns that are multiplied, and states that are off
+        by d, change a command by the gains times what is changed. Of one state, its sensor's zero
+        may differ; all may be off as a program passed them.
+        """
+        policy, trial, n, m = self.policy, self.trial, self.model.n, self.model.m
+        free = replace(policy, low=np.full(m, -np.inf), high=np.full(m, np.inf))
+        run = commanded(free, trial)
+        off, T = (run.sent - run.asked) / run.size, len(run.sent)
+        assert policy.gain is not None
+        gains = policy.gain[:T, :, :n] / run.size[:, None]
+        inside, asked = (
+            (u > policy.low) & (u < policy.high) for u in (run.sent, run.asked)
+        )  # at its limits a command tells nothing
+        log = [one for row in known for one in row.stories if one.kind is Kind.UNIT]
 
+        def about(by: float) -> tuple[float, bool]:
+            return round(float(np.log(abs(by))), 1), by > 0
 
-def _misordered(model: Model, own: Ran, order: Sequence[int]) -> Story:
-    """Return the story that a program passed the states in this order."""
-    passed, right = tuple(model.state_names[k] for k in order), model.state_names
-    moved = [name for name, now in zip(right, passed, strict=True) if name != now]
-    price = MARGIN * (1 - len(moved) / model.n)
-    return _passed("run.passed", own, price, moved, passed=passed, order=right)
+        tried = {(one.names, about(one.by)) for one in log}
+        for group in dict.fromkeys((*(one.names for one in log), tuple(self.logged))):
+            some = np.isin(self.names, group)
+            fed = np.einsum("tmn,tn->tm", gains, some[:n] * trial.states[:T])
+            slope = some[n:] * run.sent / run.size - fed
+            where = asked if some[n:].any() else inside
+            size = float((slope[where] ** 2).sum())
+            by = 1 - float((slope[where] * off[where]).sum()) / size if size else np.nan
+            by = float(f"{by:.3g}")
+            if by and np.isfinite(by) and about(by) != about(1) and (group, about(by)) not in tried:
+                columns = tuple(np.flatnonzero(some).tolist())
+                changed = Account("unit", columns, 1 / by).mended(trial)
+                yield Row(policy, changed, (Story(Kind.UNIT, price=MARGIN, names=group, by=by),))
+        inside &= asked
+        rest, design = off[inside], gains[inside]
+        if inside.any(axis=1).sum() < STEPS_TO_JUDGE:
+            return
+        each = (design * rest[:, None]).sum(axis=0) / np.maximum((design**2).sum(axis=0), 1e-300)
+        for i, (name, unit) in enumerate(self.model.states.items()):
+            by = float(f"{each[i]:.3g}")
+            if name in self.logged and by:
+                told = found("log.zero", name, ran=self.own.id, add=by, off=Quantity(abs(by), unit))
+                told = told.also(size="small" if by > 0 else "large")
+                told = told.also(tables=tables(self.model, [name]))
+                story = Story(Kind.LOG, told, price=MARGIN, names=(name,))
+                moved = replace(trial, states=trial.states + by * (np.arange(n) == i))
+                yield Row(policy, moved, (story,))
+        joint = np.linalg.lstsq(design, rest, rcond=1e-6)[0]
+        does = np.abs(design * joint).max(axis=0) > SLIGHT * np.abs(rest).max(initial=1e-12)
+        if does.sum() >= 2:
+            shares = zip(self.model.states.items(), joint, does, strict=True)
+            beside = [f"{name} {with_unit(figure(x, 2), u)}" for (name, u), x, is_ in shares if is_]
+            story = self.passed("run.origin", MARGIN * len(beside), off=tuple(beside))
+            moved = replace(trial, states=trial.states + np.where(does, joint, 0.0))
+            yield Row(policy, moved, (story,))
 
+    def smoothed(self) -> Iterator[Row]:
+        """Yield the states that a first-order filter passed on, with the share that fits best.
 
-def _times(own: Ran, trial: Trial) -> Iterator[Row]:
-    """Yield the policy at other times than the run's, and without its feedback."""
-    policy, times = own.policy, TIMES
-    if not np.abs(trial.inputs - policy.past).max() <= 1e-9:  # some were sent
-        times = {unit: factor for unit, factor in times.items() if np.isfinite(factor)}
-    for unit, factor in times.items():
-        story = _passed("run.passed", own, time=unit)
-        yield Row(_at_times(policy, factor), trial, (story,))
-    if policy.gain is not None:
-        alone = replace(policy, gain=None, reference=None)
-        yield Row(alone, trial, (_passed("run.unfed", own),))
+        One filter serves all states, the velocities, or one of them.
+        """
+        policy, trial, names = self.policy, self.trial, self.policy.state_names
+        T = min(trial.steps, policy.horizon)
+        assert policy.gain is not None
+        fed = np.abs(policy.gain[..., : len(names)]).max(axis=(0, 1)) > 0
+        some = [name for name, is_ in zip(names, fed, strict=True) if is_]
+        moving = [name for name in some if name in velocities(self.model)]
+        groups = [some, moving, [n for n in some if n not in moving], *([n] for n in some)]
+        smooth = filtered(trial.states, SHARES)
+        for group in filter(None, dict.fromkeys(map(tuple, groups))):
+            passed = np.where(np.isin(names, group), smooth, trial.states)
+            asked = policy.commands(passed[:, :T], past_of(policy, trial))
+            size = np.maximum(np.abs(asked).max(axis=1, keepdims=True), 1e-12)
+            best = int(np.argmin((((trial.inputs[:T] - asked) / size) ** 2).mean(axis=(1, 2))))
+            share = float(SHARES[best])
+            lag = Quantity(share / (1 - share) * trial.dt, "s")
+            story = self.passed("run.smoothed", states=group, share=share, lag=lag)
+            yield Row(policy, replace(trial, states=passed[best]), (story,))
+
+    def clipped(self) -> Iterator[Row]:
+        """Yield the policy with commands that are cut inside their limits.
+
+        A cut repeats one value to the last digit wherever the policy asks for more.
+        """
+        policy, cuts = self.policy, dict[str, list[float]]()
+        run, ends = commanded(policy, self.trial), np.stack([policy.low, policy.high])
+        cut = np.zeros(len(run.sent), bool)
+        for side, sign in enumerate((-1.0, 1.0)):
+            most = (sign * run.sent).max(axis=0, initial=-np.inf)
+            at = sign * run.sent >= most - FINE**2 * run.size
+            more = sign * run.asked > most + SLIGHT * run.size
+            inside = most < sign * ends[side] - SLIGHT * run.size
+            often = at.sum(axis=0) >= max(STEPS_TO_JUDGE, len(cut) / STEPS_TO_JUDGE / 2)
+            often &= (at & more).sum(axis=0) > NEARLY_ALL * at.sum(axis=0)
+            for j in np.flatnonzero(inside & often):
+                ends[side, j] = run.sent[at[:, j], j][0]
+                cuts.setdefault(policy.input_names[j], []).append(float(ends[side, j]))
+                cut |= at[:, j]
+        # unlike what is sent before a run and after it
+        held = (ends[0] > policy.low) & (ends[0] >= policy.past)
+        held |= (ends[1] < policy.high) & (ends[1] <= policy.past)
+        if cuts and not held.any():
+            where = tuple(f"{n} = {number(v)}" for n, some in cuts.items() for v in some)
+            told = found("run.clipped", *cuts, ran=self.own.id, share=float(cut.mean()), at=where)
+            clipped = replace(policy, low=ends[0], high=ends[1])
+            yield Row(clipped, self.trial, (Story(Kind.PROGRAM, told),))
+
+    def held(self) -> Iterator[Row]:
+        """Yield the policy that keeps its last command wherever the log has it once more.
+
+        A policy's plan, gains and reference change from step to step, so its commands change even
+        if no new states arrive: where they stay the same to the last digit, the step was not run.
+        """
+        policy, trial, m = self.policy, self.trial, self.model.m
+        T, same = min(trial.steps, policy.horizon), np.zeros(policy.horizon, bool)
+        before = np.vstack([past_of(policy, trial), trial.inputs[: T - 1]])
+        same[:T] = (np.abs(trial.inputs[:T] - before) <= 1e-9).all(axis=1)
+        unsent, changed = int(np.argmin(same)), np.flatnonzero(~same[:T])
+        lost = float(same[:T].mean())
+        if unsent > LATEST:
+            story = self.passed("run.unsent", steps=unsent)
+        elif len(changed) >= STEPS_TO_JUDGE and lost > PART:
+            every, dt = 1e3 * policy.dt * float(np.median(np.diff(changed))), 1e3 * policy.dt
+            story = self.passed("run.skipped", lost=lost, every=every, dt=dt)
+        else:
+            return
+        shape = (policy.horizon, m, self.model.n + sum(policy.depths))
+        gain = np.zeros(shape) if policy.gain is None else np.array(policy.gain)
+        reference = np.zeros(shape[::2]) if policy.reference is None else np.array(policy.reference)
+        gain[same], reference[same] = 0.0, 0.0
+        newest = self.model.n + np.cumsum([0, *policy.depths[:-1]])  # of the past inputs
+        gain[np.flatnonzero(same)[:, None], np.arange(m), newest] = 1.0
+        sent = np.where(same[:, None], 0.0, policy.feedforward)
+        kept = replace(policy, feedforward=sent, gain=gain, reference=reference)
+        yield Row(kept, trial, (story,))
+
+    def later(self, waits: bool) -> Iterator[Row]:
+        """Yield the policy from the later step that fits the first command best.
+
+        The program's clock ran before, if the log begins before the run; else the log begins late.
+        """
+        policy, most = self.policy, min(self.trial.finite_steps, self.policy.horizon)
+
+        def left(k: int) -> float:
+            run = commanded(policy.after(k), self.trial.until(min(most, policy.horizon - k)))
+            return float(np.median((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))
+
+        best = min(range(max(1, policy.horizon - STEPS_TO_JUDGE + 1)), key=left)
+        if not best:
+            return
+        late, price = policy.dt * best, MARGIN * (1 + best / policy.horizon)
+        story = self.passed("run.clock", price, step=best, seconds=late)
+        if not waits:
+            told = found("log.begun_late", ran=self.own.id, late=Quantity(late, "s"))
+            story = Story(Kind.LOG, told, price=price, rerun=True)
+        yield Row(policy.after(best), self.trial, (story,), best)
 
 
 def _at_times(policy: Policy, factor: float) -> Policy:
@@ -371,176 +507,10 @@ def _at_times(policy: Policy, factor: float) -> Policy:
     return replace(policy, feedforward=sent, gain=gain, reference=policy.reference[step])
 
 
-def _fitted(
-    model: Model, own: Ran, trial: Trial, known: Sequence[Row], logged: Sequence[str]
-) -> Iterator[Row]:
-    """Yield columns times the factor, and states from the zero, that fit the commands best.
-
-    A policy is linear in what it is fed: columns that are multiplied, and states that are off by d,
-    change a command by the gains times what is changed. Of one state, its sensor's zero may differ;
-    all may be off as a program passed them.
-    """
-    policy, names = own.policy, (*model.state_names, *model.input_names)
-    free = replace(policy, low=np.full(model.m, -np.inf), high=np.full(model.m, np.inf))
-    run, n = commanded(free, trial), model.n
-    off, T = (run.sent - run.asked) / run.size, len(run.sent)
-    assert policy.gain is not None
-    gains = policy.gain[:T, :, :n] / run.size[:, None]
-    inside, asked = (
-        (u > policy.low) & (u < policy.high) for u in (run.sent, run.asked)
-    )  # at its limits a command tells nothing
-    log = [one for row in known for one in row.stories if one.kind is Kind.UNIT]
-
-    def about(by: float) -> tuple[float, bool]:
-        return round(float(np.log(abs(by))), 1), by > 0
-
-    tried = {(one.names, about(one.by)) for one in log}
-    for group in dict.fromkeys((*(one.names for one in log), tuple(logged))):
-        some = np.isin(names, group)
-        fed = np.einsum("tmn,tn->tm", gains, some[:n] * trial.states[:T])
-        slope = some[n:] * run.sent / run.size - fed
-        where = asked if some[n:].any() else inside
-        size = float((slope[where] ** 2).sum())
-        by = 1 - float((slope[where] * off[where]).sum()) / size if size else np.nan
-        by = float(f"{by:.3g}")
-        if by and np.isfinite(by) and about(by) != about(1.0) and (group, about(by)) not in tried:
-            story = Story(Kind.UNIT, price=MARGIN, names=group, by=by)
-            yield Row(policy, multiplied(trial, group, by), (story,))
-    inside &= asked
-    rest, design = off[inside], gains[inside]
-    if inside.any(axis=1).sum() < STEPS_TO_JUDGE:
-        return
-
-    def moved(by: Array) -> Trial:
-        return replace(trial, states=trial.states + by)
-
-    each = (design * rest[:, None]).sum(axis=0) / np.maximum((design**2).sum(axis=0), 1e-300)
-    for i, name in enumerate(names[:n]):
-        by = float(f"{each[i]:.3g}")
-        if name in logged and by:
-            told = found("log.zero", name, ran=own.id, size="small" if by > 0 else "large", add=by)
-            told = told.also(off=Quantity(abs(by), model.states[name]))
-            told = told.also(tables=tables(model, [name]))
-            story = Story(Kind.LOG, told, price=MARGIN, names=(name,))
-            yield Row(policy, moved(by * (np.arange(n) == i)), (story,))
-    joint = np.linalg.lstsq(design, rest, rcond=1e-6)[0]
-    does = np.abs(design * joint).max(axis=0) > SLIGHT * np.abs(rest).max(initial=1e-12)
-    if does.sum() >= 2:
-        shares = zip(model.states.items(), joint, does, strict=True)
-        beside = tuple(
-            f"{name} {with_unit(figure(x, 2), u)}" for (name, u), x, is_ in shares if is_
-        )
-        story = _passed("run.origin", own, MARGIN * int(does.sum()), off=beside)
-        yield Row(policy, moved(np.where(does, joint, 0.0)), (story,))
-
-
-def _smoothed(model: Model, own: Ran, trial: Trial) -> Iterator[Row]:
-    """Yield the states that a first-order filter passed on, with the share that fits best.
-
-    One filter serves all states, the velocities, or one of them.
-    """
-    policy, names, T = own.policy, own.policy.state_names, min(trial.steps, own.policy.horizon)
-    past = policy.past if trial.start_inputs is None else trial.start_inputs
-    assert policy.gain is not None
-    fed = np.abs(policy.gain[..., : len(names)]).max(axis=(0, 1)) > 0
-    some = [name for name, is_ in zip(names, fed, strict=True) if is_]
-    moving = [name for name in some if name in velocities(model)]
-    groups = [some, moving, [n for n in some if n not in moving], *([n] for n in some)]
-    smooth = filtered(trial.states, SHARES)
-    for group in filter(None, dict.fromkeys(map(tuple, groups))):
-        passed = np.where(np.isin(names, group), smooth, trial.states)
-        asked = policy.commands(passed[:, :T], past)
-        size = np.maximum(np.abs(asked).max(axis=1, keepdims=True), 1e-12)
-        best = int(np.argmin((((trial.inputs[:T] - asked) / size) ** 2).mean(axis=(1, 2))))
-        share = float(SHARES[best])
-        lag = Quantity(share / (1 - share) * trial.dt, "s")
-        story = _passed("run.smoothed", own, states=group, share=share, lag=lag)
-        yield Row(policy, replace(trial, states=passed[best]), (story,))
-
-
-def _clipped(own: Ran, trial: Trial) -> Iterator[Row]:
-    """Yield the policy with commands that are cut inside their limits.
-
-    A cut repeats one value to the last digit wherever the policy asks for more.
-    """
-    policy, cuts = own.policy, dict[str, list[float]]()
-    run, ends = commanded(policy, trial), np.stack([policy.low, policy.high])
-    cut = np.zeros(len(run.sent), bool)
-    for side, sign in enumerate((-1.0, 1.0)):
-        most = (sign * run.sent).max(axis=0, initial=-np.inf)
-        at = sign * run.sent >= most - FINE**2 * run.size
-        more = sign * run.asked > most + SLIGHT * run.size
-        inside = most < sign * ends[side] - SLIGHT * run.size
-        often = at.sum(axis=0) >= max(STEPS_TO_JUDGE, len(cut) / STEPS_TO_JUDGE / 2)
-        for j in np.flatnonzero(inside & often & ((at & more).sum(axis=0) > 0.8 * at.sum(axis=0))):
-            ends[side, j] = run.sent[at[:, j], j][0]
-            cuts.setdefault(policy.input_names[j], []).append(float(ends[side, j]))
-            cut |= at[:, j]
-    # unlike what is sent before a run and after it
-    held = (ends[0] > policy.low) & (ends[0] >= policy.past)
-    held |= (ends[1] < policy.high) & (ends[1] <= policy.past)
-    if cuts and not held.any():
-        where = tuple(f"{n} = {number(v)}" for n, some in cuts.items() for v in some)
-        told = found("run.clipped", *cuts, ran=own.id, share=float(cut.mean()), at=where)
-        clipped = replace(policy, low=ends[0], high=ends[1])
-        yield Row(clipped, trial, (Story(Kind.PROGRAM, told),))
-
-
-def _held(own: Ran, trial: Trial) -> Iterator[Row]:
-    """Yield the policy that keeps its last command wherever the log has it once more.
-
-    A policy's plan, gains and reference change from step to step, so its commands change even if no
-    new states arrive: where they stay the same to the last digit, the step was not run.
-    """
-    policy, n, m = own.policy, len(own.policy.state_names), len(own.policy.input_names)
-    T, past = min(trial.steps, policy.horizon), trial.start_inputs
-    before = np.vstack([policy.past if past is None else past, trial.inputs[: T - 1]])
-    same = np.zeros(policy.horizon, bool)
-    same[:T] = (np.abs(trial.inputs[:T] - before) <= 1e-9).all(axis=1)
-    unsent, changed = int(np.argmin(same)), np.flatnonzero(~same[:T])
-    lost = float(same[:T].mean())
-    if unsent > LATEST:
-        story = _passed("run.unsent", own, steps=unsent)
-    elif len(changed) >= STEPS_TO_JUDGE and lost > PART:
-        every, dt = 1e3 * policy.dt * float(np.median(np.diff(changed))), 1e3 * policy.dt
-        story = _passed("run.skipped", own, lost=lost, every=every, dt=dt)
-    else:
-        return
-    shape = (policy.horizon, m, n + sum(policy.depths))
-    sent, gain, reference = (
-        np.array(np.zeros(other) if x is None else x)
-        for x, other in (
-            (policy.feedforward, shape[:2]),
-            (policy.gain, shape),
-            (policy.reference, shape[::2]),
-        )
-    )
-    newest = n + np.cumsum([0, *policy.depths[:-1]])  # of the past inputs
-    sent[same], gain[same], reference[same] = 0.0, 0.0, 0.0
-    gain[np.flatnonzero(same)[:, None], np.arange(m), newest] = 1.0
-    yield Row(replace(policy, feedforward=sent, gain=gain, reference=reference), trial, (story,))
-
-
-def _later(own: Ran, trial: Trial, waits: bool) -> Iterator[Row]:
-    """Yield the policy from the later step that fits the first command best.
-
-    The program's clock ran before, if the log begins before the run; else the log begins late.
-    """
-    policy, most = own.policy, min(trial.finite_steps, own.policy.horizon)
-
-    def left(k: int) -> float:
-        run = commanded(policy.after(k), trial.until(min(most, policy.horizon - k)))
-        return float(np.median((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))
-
-    best = min(range(max(1, policy.horizon - STEPS_TO_JUDGE + 1)), key=left)
-    if not best:
-        return
-    late, price = policy.dt * best, MARGIN * (1 + best / policy.horizon)
-    story = _passed("run.clock", own, price, step=best, seconds=late)
-    if not waits:
-        told = found("log.begun_late", ran=own.id, late=Quantity(late, "s"))
-        story = Story(Kind.LOG, told, price=price, rerun=True)
-    yield Row(policy.after(best), trial, (story,), best)
+def unit_by_factor(model: Model, names: Sequence[str], by: float) -> str:
+    """Return the unit of signals in a log that a factor converts to the model's; "" if unknown."""
+    own = {**model.states, **model.inputs}
+    return unit_named((own[name] for name in names), 1 / by) if names else ""
 
 
 # --- whose run it is ------------------------------------------------------------------------------

@@ -70,12 +70,11 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     if T < STEPS_TO_JUDGE or (trial.state_names, trial.input_names) != names:
         return None
     # what the policy sends on states of several ages, and on those with their noise once more
-    sent, past = np.clip(trial.inputs[:T], policy.low, policy.high), trial.start_inputs
-    width = policy.high - policy.low
+    sent, width = np.clip(trial.inputs[:T], policy.low, policy.high), policy.high - policy.low
     earlier = [states_ago(trial.states[:T], back, policy.angles) for back in BACK]
     noise = np.random.default_rng(0).normal(size=(T, trial.states.shape[1]))
     states = np.stack([*earlier, trial.states[:T] + noise * white_noise(trial.states[:T])])
-    *_, with_noise = asked = policy.commands(states, policy.past if past is None else past)
+    *_, with_noise = asked = policy.commands(states, past_of(policy, trial))
     free = asked[:-1]
     size = np.maximum(np.abs(free).max(axis=1), np.abs(sent).max(axis=0))
     size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
@@ -127,13 +126,17 @@ def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     )
 
 
+def past_of(policy: Policy, trial: Trial) -> Array:
+    """Return the inputs held before a trial: its own if they are known, else the policy's."""
+    return policy.past if trial.start_inputs is None else trial.start_inputs
+
+
 @dataclass(frozen=True, eq=False)
 class Commanded:
     """The commands of a run, as sent and as its policy asks for on the same states, (T, m) each."""
 
     sent: Array
     asked: Array
-    past: Array  # held before the run
     size: Array  # of each command, (m,)
 
 
@@ -146,10 +149,9 @@ def commanded(policy: Policy, trial: Trial) -> Commanded:
     """
     T = min(trial.finite_steps, policy.horizon)
     sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    past = policy.past if trial.start_inputs is None else trial.start_inputs
-    asked = policy.commands(trial.states[None, :T], past, sent[None])[0]
+    asked = policy.commands(trial.states[None, :T], past_of(policy, trial), sent[None])[0]
     size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
-    return Commanded(sent, asked, past, size)
+    return Commanded(sent, asked, size)
 
 
 def as_sent(policy: Policy, trial: Trial) -> bool:

@@ -286,9 +286,6 @@ def _units(
             tiny = f == DEGREES and first < n  # no unit has numbers smaller than radians by 57
             by = shown & ~Term.MOTION if tiny else shown
             yield replace(account, factor=1 / f, unit="", price=price + 0.5, terms=by)
-        if f == 1e3 and Term.ROWS in terms:
-            for power, more in ((1e6, 1.0), (1e-6, 1.5)):
-                yield replace(account, factor=power, unit="", price=price + more, terms=Term.ROWS)
 
 
 def of_commands(model: Model, *inputs: Array) -> list[Account]:

@@ -14,7 +14,7 @@ from grounded import Model, Param, Trial
 from grounded.accounts.commands import clocks_apart, how_inputs_act
 from grounded.accounts.finding import UnusableTrials
 from grounded.accounts.judge import judge
-from grounded.accounts.returned import Kind, multiplied, stories, suspicion, unit_by_factor
+from grounded.accounts.returned import Kind, stories, suspicion, unit_by_factor
 from grounded.accounts.sent import apart, follows, latest, like_predicted
 from grounded.accounts.sound_trials import sound_trials
 from grounded.accounts.table import DEGREES, Account
@@ -282,7 +282,7 @@ def test_what_the_program_passed_is_named(waiting, way):
 def test_a_column_farther_from_the_prediction_is_told_whatever_its_size(waiting, by):
     task, made = waiting
     run = programmed(task, made)
-    wrong = multiplied(run, ["x"], by)
+    wrong = Account("unit", (0,), 1 / by).mended(run)
     assert (apart(made, wrong) > apart(made, run) + 1) == (by != 1)
     names, factor = columns(task, made, wrong)
     assert like_predicted(made, run) and names == ("x",) * (by != 1)
