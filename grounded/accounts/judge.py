@@ -189,7 +189,7 @@ class _ByRows:
         not by a mere current; a hull's speed sideways, one of several in the rate of a position, is
         often noise alone.
         """
-        size = np.array([_spread(trial.states, about=0.0) for trial in trials])
+        size = np.array([_rms(trial.states) for trial in trials])
         noise = np.array([white_noise(trial.states) for trial in trials])
         dead = np.all(size <= NOISE_ALONE * noise + 1e-299, axis=0)
         for row in (row for row, gap in before.items() if gap.share > HALF):
@@ -241,13 +241,11 @@ class _ByRows:
         return Told(first, (), -least, others)
 
 
-def _spread(x: Array, about: float | None = None) -> Array:
-    """Return the standard deviation of some states (n,), or their rms; about 0 without samples."""
-    known = [z[np.isfinite(z)] for z in x.T]
-    each = [z - (z.mean() if about is None else about) for z in known if len(z)]
-    found = np.zeros(x.shape[1])
-    found[[len(z) > 0 for z in known]] = [np.sqrt((z**2).mean()) for z in each]
-    return found + 1e-300
+def _rms(x: Array) -> Array:
+    """Return the rms of the known samples of some states (T, n), all but 0 if there are none."""
+    known = np.isfinite(x)
+    squares = np.where(known, x, 0.0) ** 2
+    return np.asarray(np.sqrt(squares.sum(axis=0) / np.maximum(known.sum(axis=0), 1)) + 1e-300)
 
 
 def _nats(gap: Gap) -> float:
@@ -307,7 +305,7 @@ def _by_motion(
 def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
     """Return the trials that are predicted: some, and those of another size than the others."""
     some = {*range(0, len(trials), max(1, -(-len(trials) // TRIALS)))}
-    size = np.array([_spread(t.states[:, list(shown)]) for t in trials])
+    size = np.array([_rms(t.states[:, list(shown)]) for t in trials])
     apart = np.abs(np.log(size / np.median(size, axis=0))).max(axis=1, initial=0.0)
     return sorted(some | {int(k) for k in np.flatnonzero(apart > np.log(RPM))[:TRIALS]})
 

@@ -107,66 +107,58 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
 def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
     """Return the gap of each row, over the stretch length at which it agrees best.
 
+    What white noise of its sensor explains is no gap.
+
     Args:
         model: with these rows.
         trial: with this model's states.
         rows: of the model; those hidden by noise are missing from the result.
     """
     known = [row for row in rows if np.isfinite(trial.states[:, [*row.states]]).any(axis=0).all()]
-    found: dict[Row, Gap] = {}
-    # rows of states that are logged at the same samples are compared together
-    for some in (known,) if _together(trial, known) else ((row,) for row in known):
-        each = per_step(model, trial, some)
-        moved, said = ([np.cumsum(z[k], axis=0) for z in each] for k in (0, 1))
-        longest = max((len(x) for x in moved), default=0)
-        steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // STEPS_TO_JUDGE))
-        while usable := [k for k, x in enumerate(moved) if len(x) > STEPS_TO_JUDGE * steps]:
-            far, told = (
-                np.concatenate([z[k][steps:] - z[k][:-steps] for k in usable])
-                for z in (moved, said)
-            )
-            noise = np.concatenate([np.diff(moved[k], axis=0, n=2) for k in usable])
-            for row, gap in _over(
-                model, some, far, told, _size(noise) / np.sqrt(3), steps * trial.dt
-            ):
+    units, found = list(model.states.values()), dict[Row, Gap]()
+    ways = {
+        row: [
+            np.cumsum([z[:, row.i] for z in both], axis=1) for both in per_step(model, trial, [row])
+        ]
+        for row in known
+    }
+    longest = max((way.shape[1] for every in ways.values() for way in every), default=0)
+    steps = max(1, min(round(STRETCH / trial.dt), (longest - 1) // STEPS_TO_JUDGE))
+    while over := {row: one for row, every in ways.items() if (one := _over(row, every, steps))}:
+        for row, (far, told, noise) in over.items():
+            # relative to all states of the same unit: a row's own may hardly move
+            same = [_rms(one[1]) for other, one in over.items() if units[other.i] == units[row.i]]
+            size = max(_rms(far), _rms(told), _rms(np.array(same)))
+            if size > 0 and noise < HALF * size:
+                off, power = far - told, float(told.var())
+                share, varying = (
+                    max(x - noise**2, 0.0) ** 0.5 for x in (_rms(off) ** 2, off.var())
+                )
+                ratio = float((far * (told - told.mean())).mean() / max(power, 1e-300))
+                rate = share / (steps * trial.dt)
+                gap = Gap(share / size, varying / size, rate, ratio, power)
                 if row not in found or gap.share < found[row].share:
                     found[row] = gap
-            steps *= 2
+        steps *= 2
     return found
 
 
-def _together(trial: Trial, rows: Sequence[Row]) -> bool:
-    known = np.isfinite(trial.states[:, sorted({i for row in rows for i in row.states})])
-    return bool((known.all(axis=1) == known.any(axis=1)).all())
+def _over(row: Row, ways: Sequence[Array], steps: int) -> tuple[Array, Array, float] | None:
+    """Return displacements over so many steps, measured and by a row, and the former's noise.
 
-
-def _over(
-    model: Model, rows: Sequence[Row], far: Array, told: Array, noise: Array, length: float
-) -> Iterator[tuple[Row, Gap]]:
-    """Yield the gap of each row over stretches of one length [s].
-
-    It is relative to the motion of all states of the same unit: a row's own may hardly move. What
-    white noise of its sensor explains is no gap.
+    Args:
+        row: if its size is fitted, these are what it says at the size that fits best.
+        ways: both from the begin of each piece on, (2, T - 1).
+        steps: of a stretch; None is returned if no piece holds enough of them.
     """
-    units, told = list(model.states.values()), np.array(told)
-    for row in rows:
-        if row.low < row.high:  # of a size that is fitted
-            times = (far[:, row.i] @ told[:, row.i]) / max(
-                float((told[:, row.i] ** 2).sum()), 1e-300
-            )
-            told[:, row.i] *= np.clip(times, row.low, row.high)
-    moved, said, power = _size(far), _size(told), told.var(axis=0)
-    off, varying = (
-        np.sqrt(np.maximum(square - noise**2, 0.0))
-        for square in (_size(far - told) ** 2, np.var(far - told, axis=0))
-    )
-    both = (far * (told - told.mean(axis=0))).mean(axis=0)
-    for row in rows:
-        i, same = row.i, [one.i for one in rows if units[one.i] == units[row.i]]
-        size = float(max(moved[i], said[i], np.sqrt((said[same] ** 2).mean())))
-        if size > 0 and noise[i] < HALF * size:
-            ratio = float(both[i] / max(power[i], 1e-300))
-            yield row, Gap(off[i] / size, varying[i] / size, off[i] / length, ratio, power[i])
+    usable = [way for way in ways if way.shape[1] > STEPS_TO_JUDGE * steps]
+    if not usable:
+        return None
+    far, told = np.concatenate([way[:, steps:] - way[:, :-steps] for way in usable], axis=1)
+    noise = np.concatenate([np.diff(way[0], n=2) for way in usable])
+    if row.low < row.high:
+        told *= np.clip(float(far @ told) / max(float(told @ told), 1e-300), row.low, row.high)
+    return far, told, _rms(noise) / np.sqrt(3)
 
 
 def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Array, Array]]:
@@ -206,8 +198,8 @@ def _rates(model: Model, x: Array) -> Array:
     return np.asarray((model.system.step(x, u, model.values, INSTANT_S) - x) / INSTANT_S)
 
 
-def _size(x: Array) -> Array:
-    return np.asarray(np.sqrt((x**2).mean(axis=0)))
+def _rms(x: Array) -> float:
+    return float(np.sqrt((x**2).mean()))
 
 
 def pieces(trials: Sequence[Trial], columns: Sequence[int]) -> Iterator[Array]:
