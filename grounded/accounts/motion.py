@@ -133,16 +133,9 @@ class Ahead:
         self.left_out = self.left_out if constant else self.left_out[:, :0]
         moves = np.nanstd(logged[:, self.shown], axis=0) if good.any() else np.zeros(len(shown))
         self.least = EXACT * moves + TINY
-        params = list(model.params.values())
-        self.moving = [k for k, param in enumerate(params) if param.uncertain]
-        self.spread = np.array([params[k].spread for k in self.moving])
-        self.low, self.high = (
-            np.array([other if end is None else end for end in ends])
-            for ends, other in (
-                ([params[k].low for k in self.moving], -np.inf),
-                ([params[k].high for k in self.moving], np.inf),
-            )
-        )
+        free = {k: one for k, one in enumerate(model.params.values()) if one.uncertain}
+        self.moving, self.spread = list(free), model.spreads[list(free)]
+        self.low, self.high = np.array([one.reach for one in free.values()]).reshape(-1, 2).T
 
     @property
     def enough(self) -> bool:

@@ -198,17 +198,12 @@ def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -
     if fit is None or not fit.alike or fit.error > EXPLAINED:
         return
     plain = replace(plain, off=plain.off[: len(fit.off)])
-    motion, left = apart(own, trial, row.steps), _left(fit)
+    motion, left = apart(own, trial, row.steps), fit.left
     for story in row.stories:
         there = motion if story.kind is Kind.PROGRAM else apart(own, row.run, row.steps)
-        gained = np.log((_left(plain) + FINE) / (left + FINE)) >= story.price + MARGIN
+        gained = np.log((plain.left + FINE) / (left + FINE)) >= story.price + MARGIN
         if gained and there <= motion:
             yield replace(story, commands=float(np.log(left + FINE)), motion=there)
-
-
-def _left(ran: Following) -> float:
-    """Return the rms difference of the commands from the policy's, in units of their size."""
-    return float(np.sqrt(np.nanmean((ran.off / ran.fine) ** 2))) * FINE
 
 
 def nearest(rows: Sequence[Row]) -> list[Row]:

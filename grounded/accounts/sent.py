@@ -53,6 +53,11 @@ class Following:
         """The differences of the commands (T,), rms over the inputs in units of their size."""
         return np.asarray(np.sqrt(((self.off / self.fine) ** 2).mean(axis=1)) * FINE)
 
+    @property
+    def left(self) -> float:
+        """The same over all steps that are compared."""
+        return float(np.sqrt(np.nanmean(self.apart**2)))
+
 
 def follows(policy: Policy, trial: Trial, latest: int = 1) -> Following | None:
     """Compare the commands of a trial with a policy's, at the alignment that fits best.

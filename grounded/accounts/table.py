@@ -84,12 +84,6 @@ class Account:
         """All columns that the account concerns."""
         return frozenset((*self.columns, *(k for pair in self.pairs for k in pair)))
 
-    @property
-    def certain(self) -> bool:
-        """Whether a trial is corrected: a sign, or the unit of an angle or a rate."""
-        turning = self.unit in ("deg", "deg/s", "rpm", "rad") or abs(self.factor) in ANGULAR
-        return self.kind == "dead" or self.kind == "sign" or (self.kind == "unit" and turning)
-
     def mended(self, trial: Trial) -> Trial:
         """Return the trial as it would be without the fault."""
         if self.kind == "pace":
@@ -137,16 +131,18 @@ class Told:
 
     @property
     def certain(self) -> bool:
-        """Whether trials are corrected, rather than refused."""
-        if self.account.kind == "dead":
+        """Whether trials are corrected, rather than refused.
+
+        A sign is, and the unit of an angle or a rate; of what motion shows, only degrees, or the
+        unit of a few trials.
+        """
+        kind, unit, factor = self.account.kind, self.account.unit, abs(self.account.factor)
+        if kind == "dead":
             return not self.whole
         if self.by_motion:
-            degrees = self.account.unit.startswith("deg")
-            return degrees or (self.account.kind == "unit" and not self.whole)
-        return self.account.certain
-
-
-ANGULAR = {DEGREES, UNITS["deg"]["rad"], RPM}
+            return unit.startswith("deg") or (kind == "unit" and not self.whole)
+        turning = unit in ("deg", "deg/s", "rpm", "rad") or factor in (DEGREES, 1 / DEGREES, RPM)
+        return kind == "sign" or (kind == "unit" and turning)
 
 
 def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
