@@ -135,7 +135,8 @@ class Ahead:
         self.least = EXACT * moves + TINY
         free = {k: one for k, one in enumerate(model.params.values()) if one.uncertain}
         self.moving, self.spread = list(free), model.spreads[list(free)]
-        self.low, self.high = np.array([one.reach for one in free.values()]).reshape(-1, 2).T
+        ends = np.array([(one.low, one.high) for one in free.values()], float)  # NaN without one
+        self.low, self.high = ends.reshape(-1, 2).T
 
     @property
     def enough(self) -> bool:
@@ -203,7 +204,7 @@ class Ahead:
             moved, values = (np.repeat(one[None], len(theta), axis=0) for one in own)
             moved[:, :m] += theta[:, :m]
             shifted = values[:, self.moving] + theta[:, m:] * self.spread
-            values[:, self.moving] = np.clip(shifted, self.low, self.high)
+            values[:, self.moving] = np.fmin(np.fmax(shifted, self.low), self.high)
             return self._off(moved, values, late)
 
         (r,) = off(theta[None])
