@@ -80,12 +80,12 @@ def alike(name: str, valid: Iterable[str]) -> str:
     return lower[close[0]] if close else ""
 
 
-def needs(module: str, extra: str) -> Any:
+def needs(module: str, extra: str = "") -> Any:
     """Import a library that comes with an optional extra of grounded.
 
     Args:
         module: the import name, such as "rerun".
-        extra: the extra of grounded, such as "view".
+        extra: the extra of grounded, such as "view"; "" if it has the name of the package.
 
     Returns:
         The module.
@@ -96,6 +96,7 @@ def needs(module: str, extra: str) -> Any:
     try:
         return import_module(module)
     except ImportError as error:
+        extra = extra or module.partition(".")[0]
         raise GroundedError(
             f"this needs the package '{module}' ({error}), which comes with the extra '{extra}': "
             f"pip install '.[{extra}]' in grounded's own folder"

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from grounded.adapters.stepper import Stepper, library, model_of
+from grounded.adapters.stepper import Stepper, model_of
 from grounded.checks import refused
+from grounded.errors import needs
 from grounded.frozen import Array
 from grounded.model import Model, Param
 
@@ -59,7 +60,7 @@ class CasadiStepper(Stepper):
     def __init__(self, function: Any, *names: Iterable[str]) -> None:
         super().__init__(*names)
         self.function = function
-        ca = library("casadi")
+        ca = needs("casadi")
         given = [ca.MX.sym(f"i{i}", function.sparsity_in(i)) for i in range(function.n_in())]
         moved = function(*given)
         slopes = [ca.densify(ca.jacobian(moved, given[i])) for i in (0, 1)]

@@ -76,7 +76,7 @@ def load(xml: Any) -> Any:
     Raises:
         GroundedError: if the file is missing or MuJoCo can't load it, with MuJoCo's reason.
     """
-    mj = needs("mujoco", "mujoco")
+    mj = needs("mujoco")
     if isinstance(xml, mj.MjModel):
         return copy.deepcopy(xml)
     if str(xml).lstrip().startswith("<"):
@@ -104,7 +104,7 @@ def files_of(path: Path) -> list[Path]:
     Args:
         path: an MJCF or URDF file that MuJoCo can load.
     """
-    mj = needs("mujoco", "mujoco")
+    mj = needs("mujoco")
     listed = getattr(mj, "mju_getXMLDependencies", lambda name: [name])(str(path))
     files = {path: None} | dict.fromkeys(map(Path, listed))
     return [*files, *(mesh for mesh in _meshes(mj, path) if mesh not in files)]

@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.adapters.stepper import Stepper, library, model_of
+from grounded.adapters.stepper import Stepper, model_of
+from grounded.errors import needs
 from grounded.frozen import Array
 from grounded.model import Model, Param
 
@@ -54,7 +55,7 @@ class JaxStepper(Stepper):
         self._prepare()
 
     def _prepare(self) -> None:
-        jax = library("jax")
+        jax = needs("jax")
         over = (0, 0, None, None)
         self._steps = jax.jit(jax.vmap(self.step, over))
         self._slopes = jax.jit(jax.vmap(jax.jacfwd(self.step, argnums=(0, 1)), over))
@@ -80,7 +81,7 @@ class JaxStepper(Stepper):
 
 def _double() -> Any:
     """Return a context with double precision; older JAX has the switch in `experimental`."""
-    jax = library("jax")
+    jax = needs("jax")
     if hasattr(jax, "enable_x64"):
         return jax.enable_x64(True)
-    return library("jax.experimental").enable_x64()
+    return needs("jax.experimental").enable_x64()

@@ -49,11 +49,12 @@ from grounded.adapters.mujoco_names import (
     states_of,
     unmoved_joints,
 )
-from grounded.adapters.stepper import Stepper, library, model_of
+from grounded.adapters.stepper import Stepper, model_of
 from grounded.adapters.tangent import Coordinates
 from grounded.checks import refused, wrong
 from grounded.compile.run.interpreted import stencil
 from grounded.engine import cores
+from grounded.errors import needs
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -103,7 +104,7 @@ def model(
 
     Delays of actuators are no part of the model: `model.step.latency` has them for [task] latency.
     """
-    mj = library("mujoco")
+    mj = needs("mujoco")
     compiled = load(xml)
     if timestep is not None:
         compiled.opt.timestep = timestep
@@ -167,7 +168,7 @@ class MujocoStepper(Stepper):
         settings: Sequence[Setting],
     ) -> None:
         super().__init__(states, controls.names, [s.name for s in settings])
-        mj = library("mujoco")
+        mj = needs("mujoco")
         self._kept = np.flatnonzero(kept)
         pose = coordinates.from_qpos(coordinates.reference[None], np.zeros((1, compiled.nv)))[0]
         self._still = np.append(pose, np.zeros(compiled.nv + compiled.na))
@@ -199,7 +200,7 @@ class MujocoStepper(Stepper):
         return found
 
     def _prepare(self) -> None:
-        mj, compiled = library("mujoco"), self._model
+        mj, compiled = needs("mujoco"), self._model
         self._lock = threading.Lock()
         self._data = [mj.MjData(compiled) for _ in range(self.threads)]
         self._copies: dict[bytes, Any] = {}
@@ -315,7 +316,7 @@ class MujocoStepper(Stepper):
         """
         if self._model.na:
             return None
-        nv, mj = self._model.nv, library("mujoco")
+        nv, mj = self._model.nv, needs("mujoco")
         x, after = self.whole(x), self.whole(after)
         rate = (after[:, nv:] - x[:, nv:]) / dt
         found = np.empty((len(x), len(self.inputs)))
@@ -339,7 +340,7 @@ class MujocoStepper(Stepper):
         columns = list(self.controls.columns)
         if self.controls.torques:
             return np.array(np.clip(asked[columns], *self._spans[:, -len(columns) :]))
-        mj = library("mujoco")
+        mj = needs("mujoco")
 
         def torques(u: Array) -> Array:
             data.ctrl[columns] = u
@@ -372,19 +373,19 @@ class MujocoStepper(Stepper):
     def _write(self, model: Any, p: Array) -> None:
         for setting, value in zip(self.settings, p, strict=True):
             setting.write(model, float(value))
-        library("mujoco").mj_setConst(model, self._data[0])
+        needs("mujoco").mj_setConst(model, self._data[0])
 
     def _pool(self, threads: int) -> Any:
         """Return MuJoCo's thread pool, cached: creating one takes as long as a batch."""
         key = (os.getpid(), threads)  # a forked process does not inherit threads
         if key not in self._pools:
-            pool = library("mujoco.rollout").Rollout
+            pool = needs("mujoco.rollout").Rollout
             self._pools[key] = pool(nthread=threads if threads > 1 else 0)
         return self._pools[key]
 
     def _step(self, x: Array, u: Array, steps: int, models: Any) -> Array:
         """Run simulation steps; `models` is one model, or a list with one for each sample."""
-        mj, compiled, nv = library("mujoco"), self._model, self._model.nv
+        mj, compiled, nv = needs("mujoco"), self._model, self._model.nv
         x = self.whole(x)
         given = np.hstack([x, u])
         wild = ~(np.abs(given) < HUGE).all(axis=1, keepdims=True)
@@ -414,7 +415,7 @@ class MujocoStepper(Stepper):
 @contextmanager
 def _quiet() -> Iterator[None]:
     """Suppress MuJoCo's warnings, which would write MUJOCO_LOG.TXT to the current folder."""
-    mj = library("mujoco")
+    mj = needs("mujoco")
     heard = mj.get_mju_user_warning()
     mj.set_mju_user_warning(lambda _: None)
     try:
@@ -452,7 +453,7 @@ class MujocoBody:
     unit = "m"
 
     def __init__(self, stepper: MujocoStepper) -> None:
-        mj = library("mujoco")
+        mj = needs("mujoco")
         self._stepper, self._model = stepper, copy.deepcopy(stepper._model)
         self._data, self._kinematics = mj.MjData(self._model), mj.mj_kinematics
         self._parents = np.array(self._model.body_parentid)

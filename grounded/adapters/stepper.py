@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import needs
 from grounded.frozen import Array
 from grounded.model import Model
 
@@ -70,12 +69,3 @@ def model_of(stepper: Stepper, **fields: Any) -> Model:
         fields: the other fields of Model: states, inputs, params, angles, name ...
     """
     return Model(step=stepper, jacobian=stepper.jacobian, **fields)
-
-
-def library(name: str) -> Any:
-    """Import an optional library.
-
-    Raises:
-        GroundedError: if it is not installed, with the command that installs it.
-    """
-    return needs(name, name.partition(".")[0])

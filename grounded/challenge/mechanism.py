@@ -144,4 +144,4 @@ def simulator() -> Any:
     Raises:
         GroundedError: if it is not installed, with what to install.
     """
-    return needs("mujoco", "mujoco")
+    return needs("mujoco")

@@ -19,9 +19,9 @@ import numpy as np
 from grounded.adapters.files import load
 from grounded.adapters.mujoco import MujocoStepper
 from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
-from grounded.adapters.stepper import library
 from grounded.diagnosis.parts import Estimate
 from grounded.effects import param_name
+from grounded.errors import needs
 from grounded_trials.workspace.folder import Folder
 
 Lost = list[tuple[str, dict[str, Estimate]]]  # effects with their values
@@ -70,7 +70,7 @@ class Held:
             file: its file as it is, compiled.
             params: value and standard deviation of each parameter.
         """
-        self.mj, self.stepper, self.file = library("mujoco"), stepper, file
+        self.mj, self.stepper, self.file = needs("mujoco"), stepper, file
         self.now = copy.deepcopy(self.file)
         self._delta = dict[Key, tuple[float, float]]()  # what is added, and its variance
         for setting in stepper.settings:
