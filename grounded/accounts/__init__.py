@@ -13,5 +13,6 @@ ages          late and filtered sensors, velocities computed from positions, bia
 commands      clocks that differ, inputs that act in reverse
 signals       samples of one sensor; copies and limits of commands
 time_step     models and motions that are too fast for the steps
+levels        the numbers by which all of them judge
 finding       one fault of a sensor or command, and the corrected trials
 """

@@ -138,19 +138,15 @@ class Ages:
             said = found_("sensor.scale", w, share=lag.scale, of=q, rpm=rpm)
             yield Finding(w, said, "scale", scale=lag.scale)
         elif relation.exact and lag.one_size:
-            self.rule_out(q, w)
+            self.rule_out("rate_gain", q, w, [f"sensor_scale:{k}" for k in (q, w)])
 
-    def rule_out(self, q: str, w: str) -> None:
-        """Note that neither sensor of a position and its velocity has a scale error."""
-        self.refuted |= {f"sensor_scale:{w}", f"sensor_scale:{q}"}
-        self.refuted |= self.of_position("rate_gain", q, w)
-
-    def of_position(self, family: str, q: str, w: str) -> set[str]:
-        """Return an effect on the rate of q that a sensor of w without it rules out, if any.
+    def rule_out(self, family: str, q: str, w: str, sensors: Sequence[str]) -> None:
+        """Note effects that a position and its velocity rule out: of sensors, and on the rate of q.
 
         A heading rate that is only carried along shows what turns the robot, effects included.
         """
-        return set() if partner(self.model, q) == w else {f"{family}:{q}"}
+        carried = partner(self.model, q) == w
+        self.refuted |= {*sensors} if carried else {*sensors, f"{family}:{q}"}
 
     def late(self, relation: Integral, lag: Lag) -> Iterator[Finding]:
         """Correct a delay beyond the model's own; the later sensor has it, since none is early."""
@@ -194,7 +190,7 @@ class Ages:
         """
         (gain, std, age), (q, w) = found, (self.names[k] for k in (relation.i, relation.j))
         if abs(gain - 1) + SURELY * std < SLIGHT:
-            self.rule_out(q, w)
+            self.rule_out("rate_gain", q, w, [f"sensor_scale:{k}" for k in (q, w)])
         self.put(relation.j, [np.full_like(x, np.nan) for x in self.column(relation.j)])
         self.shown.remove(relation.j)
         said = found_("sensor.derived", w, of=q, age=age)
@@ -209,7 +205,7 @@ class Ages:
         bias, std, rms = bias_of(self.model, relation, self.trials)
         q, w = (self.names[k] for k in (relation.i, relation.j))
         if abs(bias) < SURELY * std and REPORTED_FROM * std < 2 * SLIGHT * rms:
-            self.refuted |= {f"sensor_bias:{w}"} | self.of_position("offset", q, w)
+            self.rule_out("offset", q, w, [f"sensor_bias:{w}"])
         elif abs(bias) > max(REPORTED_FROM * std, SLIGHT * rms):
             size, way = Quantity(abs(bias), self.model.states[w]), "more" if bias > 0 else "less"
             yield Finding(w, found_("sensor.scale", w, size=size, way=way, of=q), "offset")

@@ -90,8 +90,14 @@ def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Acco
         shown: indices of the states with a sensor.
         account: the fault, of another trial.
     """
+    known, ones = known_states(trial, shown), np.ones(model.m)
     with np.errstate(all="ignore"):  # a command at its limit may make a constant rate
-        return _Seen(model, trial, (), shown, constant=False).gain(account) < -HINT
+        logged, mended = (
+            Ahead(model, one, known, STARTS, constant=False, horizon=JUDGED_S)
+            for one in (trial, account.mended(trial))
+        )
+        enough = logged.enough and mended.enough
+        return enough and mended.plain(ones).missed - logged.plain(ones).missed > HINT
 
 
 # --- by rows --------------------------------------------------------------------------------------
@@ -318,27 +324,19 @@ class _Seen:
         trial: of its states and inputs.
         rows: the kinematic rows.
         shown: indices of the states with a sensor.
-        constant: remove a constant rate of each state.
     """
 
     def __init__(
-        self,
-        model: Model,
-        trial: Trial,
-        rows: Sequence[Row],
-        shown: Sequence[int],
-        *,
-        constant: bool = True,
+        self, model: Model, trial: Trial, rows: Sequence[Row], shown: Sequence[int]
     ) -> None:
-        self.model, self.trial, self.constant = model, trial, constant
-        self.known = known_states(trial, shown)
+        self.model, self.trial, self.known = model, trial, known_states(trial, shown)
         self.gaps, self.gains = gaps(model, trial, rows), dict[Account, float]()
         self.logged = self._without(Account(""))
 
     def _without(self, account: Account) -> Ahead:
         """Return the predictions of the trial without a fault."""
         run = account.mended(self.trial)
-        return Ahead(self.model, run, self.known, STARTS, constant=self.constant, horizon=JUDGED_S)
+        return Ahead(self.model, run, self.known, STARTS, horizon=JUDGED_S)
 
     def gain(self, account: Account) -> float:
         """Return by how much less the model as it is misses without a fault [nats]."""
