@@ -132,10 +132,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
         more = search.score(whole) - search.score(search.of_size(1)[0])
         if more > LARGE_GAIN and (limit is None or len(whole.hypothesis.effects) <= limit):
             return whole
-    search.beside_parameters()
-    # with the noise that the best one leaves, others may look better
     best = search.of_size(1)[0]
-    search.extended(search.without(best, best.hypothesis.names[-1]))
     search.structures(best)
     search.calibrated(best)
     search.refined(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
@@ -151,33 +148,25 @@ def outliers(fit: Fitted) -> bool:
 
 
 def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
-    """Return the likeliest of up to `most` effects: extend the likeliest by one, repeat.
-
-    A part of a larger set may be likelier than the set that was extended to it, and is extended in
-    turn.
-    """
-    size, done = len(best.hypothesis.effects), set[frozenset[str]]()
+    """Return the likeliest of up to `most` effects: extend the likeliest by one, repeat."""
+    size = len(best.hypothesis.effects)
     while 1 <= size < most:
         best = varied(search, best)
         floor = search.score(best) - BEHIND
         others = search.of_size(size)[: RIVALS if size == 1 else 1]
-        starts = [best, *(f for f in others if f is not best and search.score(f) > floor)]
-        done |= {frozenset(fit.hypothesis.names) for fit in starts}
-        for start in starts:
+        for start in (best, *(f for f in others if f is not best and search.score(f) > floor)):
             search.extended(start, SOME)
-        search.refined(search.of_size(size + 1)[:HOPEFUL], 10)
-        search.refined(search.of_size(size + 1)[:TUNED], TO_THE_TOP)
-        tune(search, search.of_size(size + 1)[:TUNED])
-        for fit in search.of_size(size + 1)[:TUNED]:
+        size += 1
+        search.refined(search.of_size(size)[:HOPEFUL], 10)
+        search.refined(search.of_size(size)[:TUNED], TO_THE_TOP)
+        tune(search, search.of_size(size)[:TUNED])
+        for fit in search.of_size(size)[:TUNED]:
             search.calibrated(fit)
-        larger = search.of_size(size + 1)
-        if larger:
-            _nested(search, larger[0])
-            best = search.of_size(size)[0]
-        if larger and not search.score(larger[0]) < search.score(best) + NATS:
-            best, size = larger[0], size + 1
-        elif not larger or frozenset(best.hypothesis.names) in done:
+        larger = search.of_size(size)
+        if not larger or search.score(larger[0]) < search.score(best) + NATS:
             break
+        best = larger[0]
+    # it is asked last whether a sensor is late
     chosen = search.chosen(most)
     size = len(chosen.hypothesis.effects)
     if size < most and (late := search.late_sensors(chosen)):
@@ -185,9 +174,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         if len(search.chosen(most).hypothesis.effects) > size:
             return grown(search, search.chosen(most), most)
     settle(search, most)
-    chosen = search.chosen(most)
-    for fit in [chosen, *search.of_size(len(chosen.hypothesis.effects))[:TUNED]]:
-        varied(search, fit)  # the rule may prefer what blames less
+    varied(search, search.chosen(most))  # the rule may prefer what blames less
     return search.chosen(most)
 
 
@@ -201,16 +188,6 @@ def regrown(search: HypothesisSearch, leader: str, most: int) -> None:
     if singles := other.of_size(1):
         grown(other, singles[0], most)
         search.keep(list(other.fits.values()))
-
-
-def _nested(search: HypothesisSearch, larger: Fitted) -> None:
-    """Fit a set without each of its effects, with its constants and noise.
-
-    Otherwise a further effect would be credited with what better constants of the others gain.
-    """
-    h = larger.hypothesis
-    if len(h.names) > 1:
-        search.refined([(h.minus(n), larger.noise, larger.track) for n in h.names], TO_THE_TOP)
 
 
 def settle(search: HypothesisSearch, most: int) -> None:

@@ -38,7 +38,7 @@ from grounded.diagnosis.validation.ruler import Ruler
 from grounded.effects import ParamFamily
 from grounded.frozen import Array
 
-MEASURED = 6  # likeliest sets of each size, with and without free parameters, that are measured
+MEASURED = 4  # likeliest sets of each size, with and without free parameters, that are measured
 REFIT = 12  # iterations after a cause was removed
 LIKELIER_AT_MOST = 50.0  # most nats by which another fit counts as likelier
 
