@@ -132,6 +132,7 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
         more = search.score(whole) - search.score(search.of_size(1)[0])
         if more > LARGE_GAIN and (limit is None or len(whole.hypothesis.effects) <= limit):
             return whole
+    search.beside_parameters()
     best = search.of_size(1)[0]
     search.structures(best)
     search.calibrated(best)

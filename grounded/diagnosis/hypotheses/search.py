@@ -42,6 +42,7 @@ CRUDE = 1.0  # the same once a parameter has moved beyond: its full prior
 SHORTLIST = 14  # effects of a scan that are refined, and half as many parameters
 TAUS = (0.05, 0.1, 0.3)  # correlation times of coloured noise [s]
 STEPS_TAUS = (1.0, 2.0, 6.0)  # the same in steps, where a step is longer than all of TAUS
+FREED_BESIDE = 4  # effects that are fitted with the parameters freed
 # initial noise of a delayed sensor, as a fraction of its one-step residual's variance
 LATE_NOISE = 0.45
 SOME_DELAYS = 3  # grid values at which the delay of one sensor is tried
@@ -76,6 +77,7 @@ class HypothesisSearch(FittedHypotheses):
         self.taus = [tau for tau in taus if tau > 0.7 * data.dt]
         self.taus = self.taus or [k * data.dt for k in STEPS_TAUS[: len(taus)]]
         self.most = SHORTLIST // 2 if large else SHORTLIST
+        self.beside = FREED_BESIDE // 2 if large else FREED_BESIDE
         # the scan can't find them, since its noise and track belong to a log without delay
         late = [e for e in candidates if isinstance(e.family, SensorDelayFamily)]
         self.together = [e for e in late if len(e.site.targets) > 1]
@@ -184,6 +186,22 @@ class HypothesisSearch(FittedHypotheses):
         h, unit = fit.hypothesis, self.data.model.spreads
         assert h.shift is not None
         return bool((np.abs(h.shift) > h.spread * unit).any())
+
+    def beside_parameters(self) -> None:
+        """Refit the likeliest effects with the parameters free.
+
+        They start from fits with exact parameters, in which effects have their full size: beside
+        parameters that absorbed it, an effect would not grow. Either can hide the other.
+        """
+        exact = [
+            f
+            for (structure, spread, names), f in self.fits.items()
+            if len(names) == 1 and spread == 0 and structure.tau is None and not parametric(f)
+        ]
+        exact.sort(key=lambda f: -self.score(f))
+        count = self.beside if self.calibrates() else self.beside // 2
+        for fit in self.refined(exact[:count], 12):
+            self.calibrated(fit)
 
     def like(self, data: Data | None = None, but: str = "") -> Self:
         """Return a search without fits, on other data or without one effect."""
