@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from grounded.checks import refused
-from grounded.diagnosis.hypotheses.explored import FittedHypotheses
+from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delayed
