@@ -84,8 +84,7 @@ class _Descent:
         for name, pair in (("z", ("z0", "z1")), ("u", ("u0", "u1"))):
             where = self._other(pair) if stored else "null"
             self._set("rollout", ROLLOUT, name, f"ptr {where}")
-        kernel = "rollout" if runs == 1 else "rollouts"
-        f.do(f"call void @{kernel}(ptr {self.words.pointer('rollout')})")
+        f.do(f"call void @rollout(ptr {self.words.pointer('rollout')})")
 
     def _other(self, pair: tuple[str, str]) -> str:
         """The one of two arrays that is not the current one."""

@@ -63,86 +63,26 @@ class Body:
         leaf: Callable[[str, int], str],
         table: str,
         slots: Mapping[int, int],
-        packed: bool = False,
     ) -> None:
         self.f, self.width, self.graph, self.leaf = f, width, graph, leaf
         self.table, self.slots = table, slots
         self.lanes = Lanes(f, width)
         self._known: dict[int, str] = {}
         self._settings: dict[int, str] = {}
-        self.packed = packed
-        self._alike: dict[int, list[int]] = {}  # arguments that are computed together
         self._exact = False  # whether the node that is being written is never smoothed
 
     def values(self, outputs: Sequence[int]) -> list[str]:
         """Value names of outputs."""
-        wanted = self._unknown(outputs)
-        self._find_alike(wanted)
-        self._write(sorted(wanted))
-        return [self._known[i] for i in outputs]
-
-    def _unknown(self, outputs: Sequence[int]) -> set[int]:
-        """Nodes that are not written yet and that outputs need."""
         stack, wanted = list(outputs), set[int]()
-        while stack:
+        while stack:  # what is not written yet and outputs need
             i = stack.pop()
             if i not in wanted and i not in self._known:
                 wanted.add(i)
                 if i not in self.slots:
                     stack.extend(self.graph.nodes[i].args)
-        return wanted
-
-    def _write(self, nodes: Sequence[int]) -> None:
-        for i in nodes:
-            if i in self._alike:
-                self._write_alike(i)
-            if i not in self._known:
-                self._known[i] = self._written(i)
-
-    def _find_alike(self, wanted: set[int]) -> None:
-        """Sines, cosines and exponentials of one lane that do not wait for each other.
-
-        They are computed in the lanes of one vector: `_alike` has the arguments of each.
-        """
-        self._alike = {}
-        if self.width > 1 or not self.packed:
-            return
-        depth = dict[int, int]()  # of those below a node; the same depth: none waits for the other
-        groups = dict[tuple[int, bool], dict[int, list[int]]]()
         for i in sorted(wanted):
-            node = self.graph.nodes[i]
-            depth[i] = max((depth.get(a, 0) for a in node.args), default=0)
-            if i in self.slots or node.op not in TOGETHER:
-                continue
-            (argument,) = node.args
-            group = groups.setdefault((depth[i], node.op == "exp"), {})
-            group.setdefault(argument, []).append(i)
-            depth[i] += 1
-        for group in groups.values():
-            arguments = list(group)
-            for first in range(0, len(arguments), MOST):
-                some = arguments[first : first + MOST]
-                if len(some) > 1:
-                    self._alike |= {i: some for argument in some for i in group[argument]}
-
-    def _write_alike(self, i: int) -> None:
-        """Node i, and those that are written together with it."""
-        arguments = self._alike[i]
-        same = [j for j, others in self._alike.items() if others is arguments]
-        for j in same:
-            del self._alike[j]
-        self._write(sorted(self._unknown(arguments)))
-        size = 2 if len(arguments) == 2 else MOST
-        names = [self._known[a] for a in arguments]
-        vector = self.f.vector_of([*names, *names[:1] * (size - len(names))])
-        lanes, exponential = Lanes(self.f, size), self.graph.nodes[i].op == "exp"
-        found = (lanes.exp(vector),) if exponential else lanes.sincos(vector)
-        each = [tuple(self.f.lane(v, k, size) for v in found) for k in range(len(names))]
-        if not exponential:
-            self.lanes.angles |= {name: (s, c) for name, (s, c) in zip(names, each, strict=True)}
-            return
-        for j in same:
-            (self._known[j],) = each[arguments.index(self.graph.nodes[j].args[0])]
+            self._known[i] = self._written(i)
+        return [self._known[i] for i in outputs]
 
     def value(self, i: int) -> str:
         """One value."""
@@ -277,7 +217,6 @@ class Body:
         return self.f.div(sine, cosine, self.width)
 
 
-TOGETHER, MOST = ("sin", "cos", "exp"), 4  # what is computed side by side, and how many at most
 PLAIN = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv"}
 INTRINSIC = {"sqrt": "sqrt", "floor": "floor", "rint": "rint", "trunc": "trunc"}
 WRITTEN: dict[str, Callable[..., str]] = {

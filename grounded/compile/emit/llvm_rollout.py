@@ -1,12 +1,11 @@
-"""Kernel: W runs of a problem side by side, one for each step length alpha; or one run by itself.
+"""Kernel: runs of a problem side by side, LANES at most, one for each step length alpha.
 
     u_t = clip( ubar_t + alpha k_t + K_t (z_t - zbar_t) )
     x_{t+1} = f(x_t, u_eff_t - shift_t) + bias_t
 
 with the cost added up on the way. The lanes share the trajectory's data and differ in alpha; with
 fewer runs than lanes, one is repeated and not stored. K, zbar and k may be null, z and u too: then
-the cost is all that is wanted. A run by itself has room in its vectors: sines and exponentials of
-the model are computed for four angles at once.
+the cost is all that is wanted.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import math
 from grounded.compile.emit.llvm_batch import Words, start_table
 from grounded.compile.emit.llvm_step import Dynamics, StepWriter
 from grounded.compile.emit.llvm_text import Writer, splat
-from grounded.compile.kernel_words import ROLLOUT, Layout
+from grounded.compile.kernel_words import LANES, ROLLOUT, Layout
 
 
 def wrap(f: Writer, d: str, width: int) -> str:
@@ -44,25 +43,15 @@ def received(
     return sent
 
 
-def rollout_kernel(d: Dynamics, layout: Layout, name: str, lanes: int) -> str:
-    """`void @name(words)`."""
-    f = Writer(f"void @{name}(ptr %words)")
-    writer = _Rollout(f, d, layout, lanes)
+def rollout_kernel(d: Dynamics, layout: Layout) -> str:
+    """`void @rollout(words)`."""
+    f = Writer("void @rollout(ptr %words)")
+    writer = _Rollout(f, d, layout, LANES)
     with f.loop(writer.words.integer("H")) as t:
         writer.control(t)
         writer.save(t)
         writer.advance(t)
     writer.finish()
-    f.do("ret void")
-    return f.text()
-
-
-def single_rollout(d: Dynamics, layout: Layout) -> str:
-    """`void @rollout(words)`: one run; of a short model it takes as long as four at once."""
-    if not d.short:
-        return rollout_kernel(d, layout, "rollout", 1)
-    f = Writer("void @rollout(ptr %words)")
-    f.do("call void @rollouts(ptr %words)")
     f.do("ret void")
     return f.text()
 

@@ -128,7 +128,7 @@ class StepWriter:
                 return f.load_all(self.table, DT, w)
             return state(index) if letter == "x" else f.load(self.u, index * w, w)
 
-        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot, packed=not d.short)
+        return Body(f, w, d.graph, leaf, self.table, d.uniforms.slot)
 
     def step(self) -> list[str]:
         """From x and u to next, whose values are returned too."""

@@ -8,7 +8,7 @@ from grounded.compile.emit.llvm_batch import linearise_kernel, march_kernel, ste
 from grounded.compile.emit.llvm_box import box_functions
 from grounded.compile.emit.llvm_descent import descent_kernel
 from grounded.compile.emit.llvm_riccati import sweep_kernel
-from grounded.compile.emit.llvm_rollout import rollout_kernel, single_rollout
+from grounded.compile.emit.llvm_rollout import rollout_kernel
 from grounded.compile.emit.llvm_step import Dynamics, dynamics_of, jacobian_function, stage_tables
 from grounded.compile.emit.llvm_text import declarations
 from grounded.compile.kernel_words import LANES, MAX_INPUTS, Layout
@@ -55,8 +55,7 @@ class Source:
         return dynamics_of(self.variant, n, m, columns, self.kind, self.integrator)
 
     def _search(self, d: Dynamics, layout: Layout, width: int) -> str:
-        text = _start(d, width) + rollout_kernel(d, layout, "rollouts", LANES)
-        text += single_rollout(d, layout)
+        text = _start(d, width) + rollout_kernel(d, layout)
         if layout.m > MAX_INPUTS or not self.derivatives:
             return text
         text += box_functions(layout.m) + sweep_kernel(d, layout, width)

@@ -91,7 +91,7 @@ class Kernels:
     def search(self, layout: Layout) -> jit.Library:
         """Rollout and, for few enough inputs, sweep and descent; about a layout of z."""
         small = layout.m <= MAX_INPUTS and self._derivatives
-        names = ("rollouts", "rollout", *(("sweep", "descent") if small else ()))
+        names = ("rollout", *(("sweep", "descent") if small else ()))
         return self._library(layout, names)
 
     def full(self) -> jit.Library:
@@ -229,7 +229,7 @@ class CompiledSystem(TracedSystem):
         z, u, cost = np.empty((runs, H + 1, nz)), np.empty((runs, H, self.m)), np.empty(runs)
         known, lanes = packed(problem), np.empty(LANES)
         values = _policy(by) | {"alphas": lanes}
-        kernel = self._search(problem)[0]["rollout" if runs == 1 else "rollouts"]
+        kernel = self._search(problem)[0]["rollout"]
         for at in range(0, runs, LANES):
             some = min(LANES, runs - at)
             lanes[:some], lanes[some:] = alphas[at : at + some], alphas[at]
