@@ -204,7 +204,7 @@ class Workspace(Folder):
 
         about: dict[str, Any] = {"data": data, "group": group, "sent_before": before}
         each = logs_in(path_of(path))
-        done = [ingest_log(self.forget(), log, candidate, ahead=True, **about) for log in each]
+        done = [ingest_log(self.forget(), log, candidate, **about) for log in each]
         return done[-1]
 
     def target(

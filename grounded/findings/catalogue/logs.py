@@ -179,7 +179,7 @@ LOG: dict[str, Entry] = {
     "aside": warn(
         "{about} stays set aside and does not count: `restore {about}` undoes that",
         "[[if you don't want that, run {waits} and record another log]]",
-        hides=(*JUDGED[:-1], "run.failed", "run.asked"),
+        hides=(*JUDGED[:-1], "run.failed"),
     ),
     "repeats": warn(
         "it repeats {about} to the last bit[[: {copy:True=other trials of one candidate differ "
@@ -302,7 +302,6 @@ RUN: dict[str, Entry] = {
         "if something disturbed it, `discard` it",
         hides=("run.early", "run.failed", "run.safety"),
     ),
-    "asked": aside("it did not run {ran} as it should, as `ingest` told", ANEW),
     # its start
     "start_spoils": aside(
         "the run started with {state} = {began}, the task's start is {start}: {off} off, more "

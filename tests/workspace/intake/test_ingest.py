@@ -273,7 +273,7 @@ def test_what_can_t_be_judged_is_not_stored(w, tmp_path, monkeypatch, judge="sta
 
     for path in (first, second):  # what was there stays
         with monkeypatch.context() as patched:
-            patched.setattr(f"grounded_trials.workspace.intake.ingest.{judge}", fails)
+            patched.setattr(f"grounded_trials.workspace.intake.gone_wrong.{judge}", fails)
             with pytest.raises(GroundedError, match="not a multiple"):
                 ingest_log(w, path)
         assert sorted((w.folder / "trials").iterdir()) == before

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from grounded.diagnosis.parts import Diagnosis
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
@@ -25,8 +25,7 @@ from grounded_trials.report.forecast import anchored
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
 from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
-from grounded_trials.workspace.candidates.proposing import unanswered, undecided
-from grounded_trials.workspace.candidates.search_state import standing_in
+from grounded_trials.workspace.candidates.search_state import standing_in, undecided
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import (
     read_diagnosis,
@@ -48,7 +47,7 @@ def gather(workspace: Folder) -> Findings:
     fitting = [t.trial for t in contents.trials if workspace.fits(t.trial)]
     own = [t for t in fitting if t.candidate in known]
     data = [t for t in fitting if not t.candidate]
-    now, asked = _standing(workspace, contents)
+    now = _standing(workspace, contents)
     logs = [_drawable(t) for t in data]
 
     # the last diagnosis, and the model with what it found
@@ -64,8 +63,6 @@ def gather(workspace: Folder) -> Findings:
     except GroundedError as error:
         lost.append(Lost("the model as diagnosed", str(error)))
     since = since_diagnosis(workspace, diagnosis)
-    if asked is None:
-        asked = INSPECT if unmapped(workspace) else Situation(workspace, now).then
     return Findings(
         name=workspace.folder.resolve().name,
         task=task,
@@ -77,7 +74,7 @@ def gather(workspace: Folder) -> Findings:
         logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
         lost=tuple(lost),
         diagnosis=diagnosis,
-        then=asked,
+        then=INSPECT if unmapped(workspace) else Situation(workspace, now).then,
         better=better,
         since=since,
         adopted=adopted_rows(workspace),
@@ -93,19 +90,13 @@ def _estimated(task: Task, contents: Contents, drawn: Collection[str]) -> tuple[
     return tuple(name for name in task.model.state_names if name in found)
 
 
-def _standing(workspace: Folder, contents: Contents) -> tuple[Standing, NextCommand | None]:
-    """Return the standing, and the command by which the last trial should be discarded, or None.
-
-    It plans ahead if possible, to know whether the search has ended.
-    """
+def _standing(workspace: Folder, contents: Contents) -> Standing:
+    """Return the standing, planned ahead if possible, to know whether the search has ended."""
+    ahead, now = not workspace.config.search.refit, None
     with suppress(GroundedError):  # of damaged files
-        if (asked := unanswered(workspace)[1]) is not None:
-            now = standing_in(workspace, contents=contents)
-            return undecided(now, asked.arguments[0]), asked
-    with suppress(GroundedError):
-        ahead = not workspace.config.search.refit
-        return standing_in(workspace, ahead=ahead, contents=contents), None
-    return standing_in(workspace, contents=contents), None
+        now = standing_in(workspace, ahead=ahead, contents=contents)
+        return undecided(workspace, now)
+    return now or standing_in(workspace, contents=contents)
 
 
 def _runs(

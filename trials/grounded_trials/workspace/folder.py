@@ -182,6 +182,15 @@ class Folder:
         """The notes of the workspace."""
         return noted(self.notes.read())
 
+    def note(self, **note: str) -> None:
+        """Add a note unless an equal one exists; nothing is recorded in a read-only folder."""
+        try:
+            self.notes.add(note, again=False)
+        except GroundedError:
+            if os.access(self.folder, os.W_OK):
+                raise
+        vars(self).pop("noted", None)
+
     def forget(self) -> Self:
         """Forget everything that was read, since files may have changed; return the folder."""
         for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:

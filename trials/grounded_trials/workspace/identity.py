@@ -93,7 +93,7 @@ class Noted:
     ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
     hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
     since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
-    asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> why
+    asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> the finding
     groups: dict[str, str] = field(default_factory=dict)  # trial -> the condition it was run in
 
     @property
@@ -135,8 +135,8 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.since.append(note["candidate"])
         elif kind == "run":
             found.ran[note["trial"]] = note["sha256"]
-        elif kind == "asked":
-            found.asked[note["trial"]] = note["said"]
+        elif kind == "asked" and "finding" in note:
+            found.asked[note["trial"]] = note["finding"]
         elif kind == "group":
             found.groups[note["trial"]] = note["group"]
     return found

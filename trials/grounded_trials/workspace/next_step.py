@@ -32,6 +32,7 @@ DIAGNOSE, FIT = NextCommand("diagnose"), NextCommand("fit", ("--apply",))
 EXPORT = NextCommand("export", ("best", "--runner"))
 REPORT = NextCommand("report", ("--html",))
 FORMS = ("csv", "json", "npz")  # in which a candidate is exported
+ASIDE = "set aside"  # the verdict on a run that does not count
 BEFORE_TRIALS = ("adopt", "discard")  # verbs of commands that come before another trial
 
 
@@ -136,7 +137,7 @@ class Situation:
     def run(self) -> NextCommand:
         """One more trial: of the candidate that waits, the next or the best."""
         now, best = self.now, self.now.incumbent
-        if now.phase is Phase.AWAIT and now.outstanding is not None:
+        if now.outstanding is not None:
             return to_run(self.workspace, now.outstanding.id)
         if now.phase is Phase.PROPOSE or best is None:
             return to_plan(self.workspace)
@@ -154,6 +155,8 @@ ANY, PLANNING, ENDED = tuple(Phase), (Phase.PROPOSE,), (Phase.CONVERGED, Phase.S
 Row = tuple[tuple[Phase, ...], Callable[[Situation], Any], Callable[[Situation], Any]]
 # what comes next: the first row whose phase and condition hold gives the command
 NEXT: tuple[Row, ...] = (
+    # the last run should not count, and the user has not decided
+    (ANY, lambda s: s.now.then and s.now.then.verb == "discard", lambda s: s.now.then),
     # a better model plans better, at any point of the search
     (ANY, lambda s: s.adopt and (not s.since.newer or s.none_stood), lambda s: s.adopt),
     ((Phase.AWAIT,), lambda s: True, lambda s: s.run),
@@ -249,9 +252,13 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
         with suppress(GroundedError):  # a task that can't be planned, of which data say nothing
             handed = any(workspace.candidate_path("c").parent.glob("c*.mcap"))
             ran = handed and any(one.candidate for one in workspace.task_trials())
-            if ran and (now := standing_in(workspace)).phase is Phase.AWAIT:
+            if ran and (now := standing_in(workspace)).outstanding:
                 return Situation(workspace, now).run
         return to_learn_from(workspace)
+    if verdict == ASIDE and now.outstanding:
+        return Situation(workspace, now).run
+    if verdict == "run again":
+        now = standing_in(workspace, ahead=True)
     here = Situation(workspace, now)
     goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT) and not (now.doubt or here.none_stood)
     return PROPOSE if goes_on else here.then

@@ -16,7 +16,6 @@ changed since a candidate was proposed, so everything is checked again:
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -110,7 +109,9 @@ def checked_candidate(
         raise Void(identity, reasons)
     if (lost := unmapped(workspace)) is not None:
         reasons = (lost, *reasons)
-    _note(workspace, identity, data)
+    stored = workspace.store.list()
+    after = stored[-1].path.stem if stored else ""
+    workspace.note(note="hand-out", candidate=identity, sha256=sha256(data), after=after)
     return Handed(candidate, meta, data, check, tuple(one.weighing(Weight.WARN) for one in reasons))
 
 
@@ -140,22 +141,6 @@ def check_log(workspace: Folder) -> None:
     for one in (twice_in_time(workspace), unmapped(workspace)):
         if one is not None:
             raise GroundedError(one)
-
-
-def _note(workspace: Folder, identity: str, data: bytes) -> None:
-    """Record that a candidate was handed out: its hash, and the last trial stored by then.
-
-    Nothing is recorded in a read-only folder.
-    """
-    stored = workspace.store.list()
-    after = stored[-1].path.stem if stored else ""
-    note = {"note": "hand-out", "candidate": identity, "sha256": sha256(data), "after": after}
-    try:
-        workspace.notes.add(note, again=False)
-    except GroundedError:
-        if os.access(workspace.folder, os.W_OK):
-            raise
-    vars(workspace).pop("noted", None)
 
 
 @dataclass(frozen=True)

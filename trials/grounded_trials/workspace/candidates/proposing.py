@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import suppress
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,7 @@ from grounded.findings import Finding, Weight, found, settle
 from grounded.result import Result
 from grounded.search.difference import in_question, last_gain
 from grounded.search.noise import known_noise, noise_cost, noise_missed
-from grounded.search.standing import Ending, Phase
+from grounded.search.standing import Phase
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates import trust
 from grounded_trials.workspace.candidates.handover import (
@@ -27,9 +26,11 @@ from grounded_trials.workspace.candidates.handover import (
 )
 from grounded_trials.workspace.candidates.search_state import (
     answered,
+    asked_about,
     overtaken,
     planned,
     standing_in,
+    undecided,
 )
 from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
@@ -147,6 +148,8 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if not workspace.config.task.target:
         raise GroundedError(found("plan.no_target", then=NextCommand("target", ("SHAPE",))))
     check_log(workspace)
+    if doubted := asked_about(workspace):  # who proposes goes on with it
+        workspace.note(note="restore", trial=doubted[0].stored.digest, why="")
     told, changed = bool(workspace.noted.since), [*filter(None, [overtaken(workspace, ran=True)])]
     proposal, void = _handed_over(workspace, tick)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
@@ -182,15 +185,7 @@ def _ended(
     notes: Sequence[Finding],
     asked: NextCommand | None,
 ) -> Proposed:
-    """Return that there is nothing to run; who proposes goes on after a run that was doubted."""
-    _, doubted = unanswered(workspace)
-    if doubted is not None:  # no candidate is handed out to show that the user goes on
-        digest = workspace.store.find(doubted.arguments[0]).digest
-        gone_on = {"note": "restore", "trial": digest, "why": ""}
-        with suppress(GroundedError):  # a folder that can't be written
-            workspace.notes.add(gone_on, again=False)
-        vars(workspace).pop("noted", None)
-        status = status_of(workspace, proposal.standing)
+    """Return that there is nothing to run."""
     best, converged = proposal.standing.incumbent, status.standing.phase is Phase.CONVERGED
     if best and converged and best.candidate.model != workspace.planner.fingerprint:
         notes = [*notes, found("plan.no_better", best.candidate.id)]
@@ -294,11 +289,14 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     Raises:
         GroundedError: if a stored file is damaged.
     """
+    standing = undecided(workspace, standing)
     here, lost = Situation(workspace, standing), unmapped(workspace)
     last, then = here.diagnosis, INSPECT if lost else here.then
     gone = () if standing.phase is Phase.PROPOSE else _disowned(standing, workspace.discarded())
+    asked = asked_about(workspace)
     every = [
         *notes,
+        *([asked[1]] if asked else []),
         *([lost.weighing(Weight.NOTE)] if lost else []),
         *gone,
         *filter(None, [overtaken(workspace)]),
@@ -342,64 +340,7 @@ def _certainty(now: Standing) -> tuple[Finding, ...]:
 
 def status_in(workspace: Folder) -> Status:
     """Return where the search stands; it waits if its last trial should be discarded first."""
-    asked, then = unanswered(workspace)
-    if then is None:
-        return status_of(workspace, standing_in(workspace, ahead=True))
-    now = undecided(standing_in(workspace), then.arguments[0])
-    return replace(status_of(workspace, now, asked), then=then)
-
-
-def unanswered(workspace: Folder) -> tuple[tuple[Finding, ...], NextCommand | None]:
-    """Return why the last trial should be discarded, and the command for it.
-
-    Args:
-        workspace: the workspace with the trials.
-
-    Returns:
-        (), None if nothing is wrong with it, if it ran another policy of a candidate's name, or if
-        the user has decided.
-    """
-    last = next((one for one in reversed(workspace.trials()) if workspace.fits(one.trial)), None)
-    if last is None or "~" in last.trial.candidate or _decided(workspace, last):
-        return (), None
-    some = settle(one for one in _open(workspace, last) if one)
-    aside = tuple(one for one in some if one.weight is Weight.ASIDE)
-    return aside, NextCommand("discard", (last.stored.id,)) if aside else None
-
-
-def _open(workspace: Folder, last: StoredTrial) -> Iterator[Finding | None]:
-    """Yield what a stored trial shows that may be a reason to discard it."""
-    if last.stored.digest in workspace.noted.asked:
-        yield found("run.asked", trial=last.stored.id, ran=last.trial.candidate)
-        return
-    from grounded_trials.workspace.intake.gone_wrong import Run  # slow
-
-    history = standing_in(workspace).history
-    tried = next((t for t in history if t.candidate.id == last.trial.candidate), None)
-    run = Run(workspace, last.measured, tried, history)
-    yield from run.shown(own="source" not in last.meta)
-
-
-def _decided(workspace: Folder, last: StoredTrial) -> bool:
-    """Return whether a trial was restored, or a candidate handed out after it."""
-    noted, stored = workspace.noted, last.stored
-    after = max((int(name[1:].split("-")[0]) for name in noted.last if name), default=0)
-    return after >= stored.number or bool({stored.path.stem, stored.digest} & noted.kept)
-
-
-def undecided(now: Standing, trial: str) -> Standing:
-    """Return the standing as it waits for the user to discard a trial, or to go on with it.
-
-    The verdict of a search that counts that trial would contradict the advice to discard it.
-    """
-    ran = next((t for t in now.history if trial in [one.id for one in t.trials]), None)
-    if ran is None:
-        return now
-    made = ran.candidate
-    why = found("search.discard_first", trial, trial=trial, candidate=made.id)
-    history = tuple(replace(t, asked=True) if t is ran else t for t in now.history)
-    waits = replace(now, phase=Phase.AWAIT, outstanding=made, missing=1, history=history)
-    return replace(waits, findings=(why,), ending=Ending.NONE)
+    return status_of(workspace, standing_in(workspace, ahead=True))
 
 
 def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:

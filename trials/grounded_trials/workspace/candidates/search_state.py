@@ -25,7 +25,7 @@ from grounded.findings import Finding, Weight, found
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, standing
 from grounded_trials.workspace.folder import Contents, Folder
-from grounded_trials.workspace.identity import other_task
+from grounded_trials.workspace.identity import StoredTrial, other_task
 from grounded_trials.workspace.last_diagnosis import readable_diagnosis, since_diagnosis
 
 if TYPE_CHECKING:
@@ -77,6 +77,33 @@ def answered(workspace: Folder, now: Standing) -> Standing:
     if (found := readable_diagnosis(workspace.reports)) is None:
         return now
     return now.answered() if since_diagnosis(workspace, found).settled else now
+
+
+def asked_about(workspace: Folder) -> tuple[StoredTrial, Finding] | None:
+    """Return the last trial, and why `ingest` told to discard it, unless the user has decided."""
+    last = next((t for t in reversed(workspace.trials()) if workspace.fits(t.trial)), None)
+    why = workspace.noted.asked.get(last.stored.digest) if last else None
+    if last is None or why is None:
+        return None
+    decided = {last.stored.path.stem, last.stored.digest} & workspace.noted.kept
+    return None if decided else (last, Finding.from_json(json.loads(why)))
+
+
+def undecided(workspace: Folder, now: Standing) -> Standing:
+    """Return the standing as it waits for the user to discard the last trial, or to go on with it.
+
+    The verdict of a search that counts that trial would contradict the advice to discard it.
+    """
+    asked = asked_about(workspace)
+    trial = asked[0].stored.id if asked else ""
+    ran = next((t for t in now.history if trial in [one.id for one in t.trials]), None)
+    if ran is None:
+        return now
+    made, then = ran.candidate, NextCommand("discard", (trial,))
+    why = found("search.discard_first", trial, trial=trial, candidate=made.id, then=then)
+    history = tuple(replace(t, asked=True) if t is ran else t for t in now.history)
+    waits = replace(now, phase=Phase.AWAIT, outstanding=made, missing=1, history=history)
+    return replace(waits, findings=(why,), ending=Ending.NONE)
 
 
 def planned(

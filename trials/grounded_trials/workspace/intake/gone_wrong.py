@@ -16,8 +16,8 @@ By how much a start away from [task] start changes the utility, the model says: 
 candidate from there and from s_0. A run whose utility it changes much says nothing about its
 candidate, and must be run again; unless it is better than the best from either start.
 
-`ingest` asks once, `status` again (`proposing.unanswered`), until the user has decided: the trial
-is discarded, or restored, or a candidate was handed out after it.
+`ingest` asks once and notes it; `status` asks again (`identity.Noted.asked`), until the user has
+decided: the trial is discarded or restored, or `propose` goes on.
 """
 
 from __future__ import annotations
@@ -43,8 +43,9 @@ from grounded.frozen import Array, median
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import Repeats, worth_of_start
 from grounded.search.noise import sample_noise
+from grounded.search.standing import Standing
 from grounded.trial import Interpolated, Trial, interpolate_gaps
-from grounded_trials.workspace.candidates.search_state import standing_of
+from grounded_trials.workspace.candidates.search_state import standing_in, standing_of
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable
 
@@ -68,14 +69,25 @@ class Run:
     Args:
         workspace: the workspace with the task, the model and the candidates.
         trial: the trial as stored.
-        tried: its candidate with all of its runs; None if it ran none of the search.
-        history: all candidates with their runs.
     """
 
     workspace: Folder
     trial: Trial
-    tried: Tried | None = None
-    history: Sequence[Tried] = ()
+
+    @cached_property
+    def now(self) -> Standing | None:
+        """The standing of the search with it; None for data, which never move a search."""
+        return standing_in(self.workspace) if self.trial.candidate else None
+
+    @property
+    def history(self) -> Sequence[Tried]:
+        """All candidates with their runs; none for data."""
+        return self.now.history if self.now else ()
+
+    @property
+    def tried(self) -> Tried | None:
+        """Its candidate with all of its runs; None if it ran none of the search."""
+        return next((t for t in self.history if t.candidate.id == self.trial.candidate), None)
 
     @cached_property
     def bridged(self) -> Interpolated:

@@ -8,23 +8,23 @@ second ingest finds the first.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from grounded.accounts.sent import as_sent
 from grounded.checks import refused
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import NULL, UNSAID, Document, with_unit
 from grounded.search.candidate import Candidate
-from grounded.search.standing import Phase
 from grounded.task import Task
 from grounded.trial import HUGE, Trial
 from grounded_trials.store.own_files import CANDIDATE, TRIAL, format_of
@@ -32,7 +32,6 @@ from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
     overtaken,
-    standing_in,
     standing_of,
 )
 from grounded_trials.workspace.folder import Folder
@@ -50,7 +49,7 @@ from grounded_trials.workspace.intake.opening.stored_before import (
     repeated,
 )
 from grounded_trials.workspace.new_target import PROPOSE
-from grounded_trials.workspace.next_step import Situation, after_log
+from grounded_trials.workspace.next_step import ASIDE, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:
@@ -58,7 +57,6 @@ if TYPE_CHECKING:
 
 FAULTS = (*COLUMNS, "run.exchanged")  # the next plan would be based on wrong columns
 ROUNDED = 0.01  # of an input's largest command: a smaller excess over its limits is rounding
-ASIDE = "set aside"  # the verdict on a run that does not count
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -116,13 +114,9 @@ def ingest_log(
     *,
     data: bool = False,
     group: str = "",
-    ahead: bool = False,
     sent_before: Mapping[str, float] = MappingProxyType({}),
 ) -> Ingested:
-    """Check a log and store it as a trial, see `Workspace.ingest`; store nothing on an error.
-
-    With `ahead` the next candidate is planned if the next command depends on it, see `standing_in`.
-    """
+    """Check a log and store it as a trial, see `Workspace.ingest`; store nothing on an error."""
     candidate = candidate and candidate_named(workspace, candidate)
     kind = format_of(path)
     if kind == CANDIDATE:
@@ -160,10 +154,10 @@ def ingest_log(
             note = {"note": "group", "trial": added.sha256[:DIGITS], "group": group}
             new.enter_context(workspace.notes.adding(note, again=True))
         workspace.forget_trials()
-        return _judged(workspace, read, added, before, ahead=ahead)
+        return _judged(workspace, read, added, before)
 
 
-def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: bool) -> Ingested:
+def _judged(workspace: Folder, read: Read, added: Added, before: str) -> Ingested:
     """Return the result for a trial that was just stored: findings, verdict, next command.
 
     Args:
@@ -171,65 +165,55 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str, *, ahead: 
         read: how it was read.
         added: its file in the store.
         before: the trial that it repeats to the last bit, or "".
-        ahead: plan the next candidate if the next command depends on it.
     """
-    trial = replace(read.trial, id=added.id)
-    now = standing_in(workspace) if trial.candidate else None
-    history = now.history if now else ()
-    tried = next((t for t in history if t.candidate.id == trial.candidate), None)
-    run, aside = Run(workspace, trial, tried, history), added.id in workspace.discarded()
-    waiting = now and now.phase is Phase.AWAIT and now.outstanding
-    waits = waiting.id if waiting else ""
-
-    # what is to be known of the log, the search, the columns and the run
-    told = [*read.findings]
-    if before:
-        told.append(found("log.repeats", before, copy=others_differ(workspace)))
-    if aside:
-        told.append(found("log.aside", added.id, waits=waits))
-    if was := read.before:
-        ran = was.trial.candidate or "data"
-        told.append(found("log.before", was.stored.id, ran=ran, used=not aside))
-    if now and (changed := overtaken(workspace, ran=True)):
-        told.append(changed.weighing(Weight.WARN))
+    run = Run(workspace, replace(read.trial, id=added.id))
+    aside, ran = added.id in workspace.discarded(), bool(run.trial.candidate)
+    told = [*read.findings, *_circumstances(run, read, before, aside=aside)]
     told += _checked(run, read.last_s)
-    shown = run.shown(own=read.own, doubted=read.doubted, silent=read.silent)
-    findings = settle([*told, *filter(None, shown)])
-
-    # `status` can't tell from the trial alone that it was taken against its commands
-    asked = (one for one in read.findings if one.weight is Weight.ASIDE)
-    if read.doubted and not aside and (why := next(asked, None)):
-        note = {"note": "asked", "trial": added.sha256[:DIGITS], "said": why.code}
-        with suppress(GroundedError):  # a folder that can't be written
-            workspace.notes.add(note, again=False)
-        vars(workspace).pop("noted", None)
-
-    verdict = ASIDE if aside else _verdict(run)
-    if ahead and verdict == "run again":
-        now = standing_in(workspace, ahead=True)
-    if not aside and any(one.weight is Weight.ASIDE for one in findings):
-        then = NextCommand("discard", (added.id,))
-    elif now and aside and waits:
-        then = Situation(workspace, now).run
-    else:
-        then = after_log(workspace, verdict, now)
-    judged = [run.whole] * bool(trial.candidate)
+    told += filter(None, run.shown(own=read.own, doubted=read.doubted, silent=read.silent))
+    findings = settle(told)
+    why = next((one for one in findings if one.weight is Weight.ASIDE and not aside), None)
+    if why:  # `status` asks again
+        said = json.dumps(why.to_json())
+        workspace.note(note="asked", trial=added.sha256[:DIGITS], finding=said)
+    verdict, tried = ASIDE if aside else _verdict(run), run.tried
+    found = dict[str, Any](verdict=verdict, accepted=None)
+    if tried:
+        found |= {"accepted": tried.accepted, "mean": tried.utility, "runs": len(tried.trials)}
+        found |= {"crashed": tried.failed} if verdict == "crashed" else {}
     return Ingested(
         trial=added.id,
         sha256=added.sha256,
         known=added.known,
-        candidate=trial.candidate,
-        utility=workspace.task.utility(judged[0]) if judged else None,
-        accepted=tried.accepted if tried else None,
+        candidate=run.trial.candidate,
+        utility=workspace.task.utility(run.whole) if ran else None,
         findings=findings,
         signals=read.signals,
-        verdict=verdict,
-        mean=tried.utility if tried else math.nan,
-        runs=len(tried.trials) if tried else 0,
-        crashed=tried.failed if tried and verdict == "crashed" else (),
-        off_target=off_target_of(workspace.task, judged),
-        then=then,
+        off_target=off_target_of(workspace.task, [run.whole] if ran else []),
+        then=NextCommand("discard", (added.id,)) if why else after_log(workspace, verdict, run.now),
+        **found,
     )
+
+
+def _circumstances(run: Run, read: Read, before: str, *, aside: bool) -> Iterator[Finding]:
+    """Yield what is to be known of a log beside the store and the search.
+
+    Args:
+        run: the trial.
+        read: how it was read.
+        before: the trial that it repeats to the last bit, or "".
+        aside: whether it is set aside.
+    """
+    workspace, now = run.workspace, run.now
+    if before:
+        yield found("log.repeats", before, copy=others_differ(workspace))
+    if aside:
+        waits = now.outstanding.id if now and now.outstanding else ""
+        yield found("log.aside", run.trial.id, waits=waits)
+    if was := read.before:
+        yield found("log.before", was.stored.id, ran=was.trial.candidate or "data", used=not aside)
+    if now and (changed := overtaken(workspace, ran=True)):
+        yield changed.weighing(Weight.WARN)
 
 
 def _verdict(run: Run) -> str:

@@ -14,7 +14,6 @@ import numpy as np
 
 from grounded.checks import refused
 from grounded.errors import NextCommand
-from grounded.search.standing import Phase
 from grounded.trial import Trial, scattered
 from grounded_trials.logs.log_paths import log_files, on_disk
 from grounded_trials.store.trial_file import read_trial
@@ -52,7 +51,7 @@ def refuse_as_another(
         facts, then = {"wanted": wanted or "data"}, NextCommand("discard", (identity,))
     else:
         now = standing_in(workspace)
-        waits = now.outstanding.id if now.outstanding and now.phase is Phase.AWAIT else ""
+        waits = now.outstanding.id if now.outstanding else ""
         then = to_run(workspace, waits) if waits else NextCommand("status")
         facts = {"waits": waits}
         if wanted:
