@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import stat
 import subprocess
@@ -248,14 +247,6 @@ def test_what_is_adopted_is_what_the_trials_tell(learnt, case):
     done = w.adopt(FRICTION).to_json()
     assert (done["jointly"], done["left"]) == (jointly, left)
     assert done["params"] == ({} if left else {"mass": 1.4})
-
-
-@pytest.mark.parametrize("value", [0.05, -0.05])
-def test_a_sensor_s_bias_is_said_to_move_start_and_target(learnt, value):
-    text = json.dumps(DIAGNOSIS).replace(FRICTION, "sensor_bias:v")
-    written(learnt, **json.loads(text.replace('"k": {"value": 0.3', f'"b": {{"value": {value}')))
-    done = grounded("-C", learnt, "adopt", "sensor_bias:v")
-    assert done.code == 0 and f"offset {-value:+}" in " ".join(done.err.split())
 
 
 needs_posix = pytest.mark.skipif(sys.platform == "win32", reason="needs a POSIX shell")

@@ -21,7 +21,7 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import read_diagnosis
 from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.where_to_mend import where_to_mend
-from workspaces import CONFIG, edit, make
+from workspaces import edit, make
 
 DT = 0.05
 
@@ -264,27 +264,6 @@ def test_a_deleted_candidate_is_found_unless_a_trial_carries_it(ended):
     assert waiting in found.file
 
 
-def test_joined_workspaces_never_mix_two_policies_of_one_name(ended, tmp_path):
-    config = CONFIG.replace("max_trials", "refit = true\nmax_trials")  # the same task
-    other = searched(tmp_path / "other", config=config)
-    assert other.task.hash == ended.task.hash
-    assert other.candidate_bytes("c0002") != ended.candidate_bytes("c0002")
-    before = ended.status()
-    for path in (other.folder / "trials").iterdir():
-        if not (ended.store.folder / path.name).exists():
-            shutil.copy(path, ended.store.folder)
-    now = ended.status()
-    tried = now.standing.history[1]
-    assert len(tried.trials) == 1 and tried.utility == before.standing.history[1].utility
-    assert len(ended.trials()) > len(before.standing.history)
-    (name,) = {t.trial.candidate for t in ended.trials() if "~" in t.trial.candidate}
-    assert name.startswith("c0002~")
-    assert "search.uncounted" in {one.code for one in now.findings}
-    assert ended.verify().damaged == ()
-    ended.candidate_path("c0002").unlink()  # and the first that ran it has the name
-    assert len(ended.status().standing.history[1].trials) == 1
-
-
 def test_a_slow_propose_does_not_replace_what_was_handed_out(ended, monkeypatch):
     from grounded.search import improve
 
@@ -303,13 +282,3 @@ def test_a_slow_propose_does_not_replace_what_was_handed_out(ended, monkeypatch)
     mine = ended.propose()
     assert mine.candidate.id == quick[1] and not mine.proposal.is_new
     assert ended.candidate_bytes(quick[1]) == quick[2] and ended.verify().damaged == ()
-
-
-def test_what_a_bare_trial_ran_is_kept_beside_it(ended, tmp_path):
-    from grounded_trials.store.trial_file import read_trial, write_trial
-
-    ran = ended.run(ended.propose().candidate.id)
-    trial, meta, _ = read_trial(ran.trial_file)
-    write_trial(tmp_path / "bare.mcap", trial, {"kind": "trial", "task": meta["task"]})
-    found = ended.ingest(tmp_path / "bare.mcap")
-    assert ended.noted.ran.keys() == {found.sha256[:16]}

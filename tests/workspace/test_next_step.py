@@ -10,7 +10,6 @@ import pytest
 
 from cli import grounded, plain, process
 from facts import holds
-from grounded.errors import GroundedError, NextCommand
 from grounded.findings import found
 from grounded.search.standing import Ending, ended
 from grounded_trials import Workspace
@@ -24,7 +23,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import model_print, read_diagnosis
 from grounded_trials.workspace.next_step import DIAGNOSE, EXPORT, after_diagnosis
 from grounded_trials.workspace.user_files.config import set_keys
-from recorded import LOGGED, record
 from reported import DIAGNOSIS, copied, diagnosed
 from workspaces import make
 
@@ -199,34 +197,6 @@ def test_a_search_that_doubts_its_model_is_diagnosed_after_two_runs(tmp_path, mo
     w.reports.mkdir()
     diagnosed(w.folder, diagnosed=taken_in(1, 2))
     assert w.status().then.verb == "adopt"
-
-
-def test_a_log_that_is_read_otherwise_now_is_ingested_again_before_anything_is_adopted(
-    tmp_path, monkeypatch
-):
-    monkeypatch.chdir(tmp_path)
-    w = Workspace(make(tmp_path / "w", config=LOGGED).folder)
-    log = record(w, tmp_path / "hand.csv", w.propose().candidate.policy, 0.0)
-    next((w.folder / "candidates").iterdir()).unlink()
-    w.ingest(log, data=True)
-    w.reports.mkdir()
-    written = w.config.file.read_text()
-    late = LAGGING | {"kind": "delay", "keys": {"delay_s": 0.02}, "delay_s": 0.02}
-    for name, now, preflight, then in (
-        ("v", 'path = "/csv.v"', [], "adopt viscous_friction:v"),
-        ("v", 'path = "/csv.v"\ndelay_s = 0.02', [late], "adopt viscous_friction:v"),
-        ("x", 'path = "/csv.y"', [], "ingest hand.csv --data"),
-        ("v", 'path = "/csv.v"\nscale = 0.5', [], "ingest hand.csv --data"),
-    ):
-        diagnosed(w.folder, diagnosed=taken_in(1), preflight=preflight)
-        w.config.file.write_text(written.replace(f'path = "/csv.{name}"', now))
-        assert following(w.folder) == then
-    with pytest.raises(GroundedError) as refused:
-        Workspace(w.folder).ingest(log, data=True)
-    assert refused.value.then.verb == "discard"
-    again = NextCommand("ingest", ("hand.csv", "--data"))
-    assert w.discard("t0001").then == again == w.status().then
-    assert w.ingest(log, data=True).then == DIAGNOSE == w.status().then
 
 
 # after a search

@@ -5,9 +5,9 @@ from __future__ import annotations
 from grounded.findings.catalogue.entry import Entry, aside, note, refuse, warn
 
 # how a run went can't be judged by a wrong log
-JUDGED: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.safety", "run.start")
+JUDGED: tuple[str, ...] = ("run.reversed", "run.early", "run.safety", "run.start")
 # of a run that its program spoilt, neither its end nor its motion says anything of the candidate
-OUTCOME: tuple[str, ...] = ("run.reversed", "run.astray", "run.early", "run.failed", "run.safety")
+OUTCOME: tuple[str, ...] = ("run.reversed", "run.early", "run.failed", "run.safety")
 SPOILT = (*OUTCOME, "run.start")  # of a log that is taken as a run all the same
 # what a program should do that sends other commands than those of the candidate
 CALL = (
@@ -35,7 +35,7 @@ LOG: dict[str, Entry] = {
         "{about} {about:is/are} [[in {unit}, not {own}]][[{times:.4g} times too {size}]][[ and of "
         "{negative}]]",
         "[[multiply the scale in {tables} by {by:.8g} (a missing one is 1)]][[let the program "
-        "write {writes}]][[, and in [limits] {limits}]]",
+        "write {writes}]]",
         hides=(*JUDGED, "log.limits", "log.stated"),
     ),
     "sign": account(
@@ -119,18 +119,9 @@ LOG: dict[str, Entry] = {
         "before the log is not in it",
         "if {name} was 0, add a row before it that says so, or ingest it with `--before {name}=0`",
     ),
-    "start_doubt": warn(
-        "where {ran} begins is in doubt: its commands fit as well from {rival:.3f} s of the log "
-        "on as from {used:.3f} s, which is used",
-        SPAN,
-    ),
-    "start_loose": warn(
-        "the start of the run is only known to {loose:size}, the time between rows",
-        "log the states that the controller used, or when it sent each command",
-    ),
     "start_assumed": warn(
-        "no start of {ran} was found in it: the run is assumed to begin where the commands first "
-        "change, at {at:.3f} s[[, {longer:.3g} s before a run must]]",
+        "no start of {ran} was found in it: the run is assumed to begin at its first command, at "
+        "{at:.3f} s",
         SPAN,
     ),
     "begun_late": refuse(
@@ -143,7 +134,7 @@ LOG: dict[str, Entry] = {
         "(rms)[[; alike up to {until}]][[; only {lasts} of commands]][[; {guessed} by [estimate] "
         "may be why]]",
         "who drove? Use --data, --candidate {ran} anyway, or set [log.span] start",
-        hides=("log.start_doubt", "log.start_loose", "run.start", "run.reversed"),
+        hides=("run.start", "run.reversed"),
     ),
     "silent": refuse(
         "{about} {about:is/are} 0 from the first step to the last, unlike in the plan of {ran}",
@@ -167,10 +158,6 @@ LOG: dict[str, Entry] = {
         "{side:late=early,early=late}",
     ),
     # stored before
-    "again": note(
-        "no candidate is waiting for a trial; its commands are those of {ran}, the best: it "
-        "counts as another run of it",
-    ),
     "before": note(
         "it was stored before, as {about} ({ran}), which is set aside[[used? : it is used as that "
         "again]]",
@@ -182,9 +169,7 @@ LOG: dict[str, Entry] = {
         hides=(*JUDGED[:-1], "run.failed"),
     ),
     "repeats": warn(
-        "it repeats {about} to the last bit[[: {copy:True=other trials of one candidate differ "
-        "and it is probably a copy,False=the system is treated as deterministic and no candidate "
-        "is run a second time from now on}]]",
+        "it repeats {about} to the last bit: either it is a copy, or the system is deterministic",
     ),
     "stored": refuse(
         "{about} is stored already, as {trial}[[ ({used})]][[other?, read in another way]]",
@@ -260,11 +245,6 @@ RUN: dict[str, Entry] = {
         CALL,
         hides=OUTCOME,
     ),
-    "missed": warn(
-        "the first command in the log is that of step {steps} of {ran}: those before were not "
-        "sent or not logged[[, and {held} held until then]]",
-        CALL,
-    ),
     "skipped": aside(
         "its commands change every {every:.3g} ms, dt is {dt:.3g} ms: {lost:%} of the steps of "
         "{ran} were not run, or not logged",
@@ -280,16 +260,11 @@ RUN: dict[str, Entry] = {
         "Then[[ `discard {trial}`,]] mend it and run again; otherwise `propose` goes on",
         hides=(*OUTCOME[1:], "log.limits"),
     ),
-    "astray": aside(
-        "it missed its prediction by {missed:,.3g}, {times:,.2g} times what runs miss otherwise",
-        ANEW,
-        hides=OUTCOME[2:],
-    ),
     "early": aside(
         "all states are known for {steps} of {horizon} steps only[[, {silent} not after that]]; "
         "until then it ran as predicted: was the recording cut off, or the robot stopped?",
         "`discard {trial}` and run {ran} again; if it crashed, `propose` goes on",
-        hides=SPOILT[3:],
+        hides=SPOILT[2:],
     ),
     "failed": warn(
         "the run ended after {steps} of {horizon} steps[[large? , with values that are too "

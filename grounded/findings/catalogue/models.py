@@ -61,12 +61,6 @@ MODEL: dict[str, Entry] = {
     ),
     # an adoption
     "adopted": note("adopted: {about}"),
-    "readings": note(
-        "targets and distances of {about} are in readings of its sensor[[, {bias} too {way}]][[, "
-        "{by:%} too {way}]][[, {age} old]]",
-        "for true values correct the log ([[offset {offset:+.3g}]][[!offset? scale or delay_s]] "
-        "in [log.state]) and the robot's program, and remove the effect",
-    ),
     # taken home
     "no_place": warn(
         "{about}[[ = {value}]] has no place in the file[[: {equation}, with {values}]]",

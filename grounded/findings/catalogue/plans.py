@@ -55,9 +55,6 @@ PLAN: dict[str, Entry] = {
         "[[exact? the prediction starts exactly at [task] start]]",
     ),
     "model": note("the model is {what}"),
-    "lacks": note(
-        "the last diagnosis found that {cause}[[, and {more:cause} more]]", "`{command}` first"
-    ),
     "no_target": refuse(
         "there is no manoeuvre to learn: [task] names no target",
         "draw one with `grounded target`; `fit` and `diagnose` need none",
@@ -86,19 +83,6 @@ PLAN: dict[str, Entry] = {
     "limits_of_log": note(
         "[limits] are only the range used in {log}",
         "enter the robot's real limits, then delete seen_in there",
-    ),
-    "falls_short": note(
-        "[[{about} {about:is/are} at a limit for {share:%} of the plan, and still ]]the plan "
-        "misses its target: {what} is off by {off:size}[[!share?  at the end]]",
-        "draw a larger or slower target, weigh inputs and their changes less, check model.py, or "
-        "widen [limits] if the robot can take more",
-    ),
-    "unguarded": note(
-        "{about} {about:leaves/leave} [safety], and [[unweighed? [reward] has no weight for "
-        "{about:its/their} target]][[!unweighed? nothing in [reward] keeps {about:it/them} "
-        "inside]]",
-        "[[unweighed? add one in [reward] state]][[!unweighed? draw the target with a column for "
-        "{about:it/each of them} (`target`); widen [safety] only if the robot may go there]]",
     ),
     "not_at_rest": warn(
         "the plan assumes {held} before the start and after the end, under which {state} changes "
@@ -137,10 +121,6 @@ PLAN: dict[str, Entry] = {
         "{trials:is/are} {gone}]][[; run {instead} instead]]",
         "[[!other? if the robot has run it meanwhile, ingest that log with --candidate "
         "{candidate}: it counts]]",
-    ),
-    "lost": note(
-        "{candidate} [[lost with {real:.4g}]][[!real? crashed]]; the best so far is {best}, "
-        "{of:.4g}",
     ),
     # what the robot will do
     "time_step": warn(
@@ -228,14 +208,14 @@ SEARCH: dict[str, Entry] = {
     # what status tells beside it
     "uncounted": note(
         "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "
-        "another task's candidate, a probe, or another policy of a candidate's name",
+        "another task's candidate or a probe",
     ),
     "left_out": note(
         "{about} {about:has/have} [[other states or inputs than {model}]][[a sampling interval of "
         "{was}, and [task] dt is {now}]]: fit, diagnose and the search leave {about:it/them} out",
     ),
     "outdated": note(
-        "the last diagnosis is outdated[[; [log] reads {reread} in another way now]][[; it had "
+        "the last diagnosis is outdated[[; it had "
         "{used} of {usable} trials]][[; adopted since: {adopted}]][[, but not "
         "{missing}]][[changed? ; the model was changed]]",
     ),

@@ -63,17 +63,6 @@ def test_a_motor_wired_wrongly_is_told_before_the_next_plan(w, tmp_path):
     assert w.propose().candidate.id == "c0002"
 
 
-def test_a_run_that_missed_by_hundreds_of_times_what_runs_miss_is_asked_about(w):
-    file = run(w, "a.force + 80.0")
-    out = grounded("-C", w.folder, "next", file).out
-    done = w.ingest(file)
-    assert of_code(done, "run.astray")[0].facts["trial"] == "t0002"
-    assert not of_code(done, "run.reversed")
-    assert done.then.verb == "discard"
-    said = out.partition("next:")[2].replace("\\", "").split()
-    assert said[-2:] == ["discard", "t0002"] and "Run c0" not in out
-
-
 @pytest.mark.parametrize(("off", "again"), [(0.6, True), (0.02, False)])
 def test_a_run_that_started_elsewhere_is_discarded_or_counts(w, off, again):
     """One output asked to discard it, called it bad luck, and exported the next candidate."""

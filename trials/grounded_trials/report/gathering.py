@@ -24,7 +24,6 @@ from grounded_trials.report.findings import Findings, Log, Run
 from grounded_trials.report.forecast import anchored
 from grounded_trials.store.store import Lost
 from grounded_trials.workspace.adoption import Better, adopted_rows, better_model
-from grounded_trials.workspace.candidates.handover import INSPECT, unmapped
 from grounded_trials.workspace.candidates.search_state import standing_in, undecided
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import (
@@ -74,7 +73,7 @@ def gather(workspace: Folder) -> Findings:
         logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
         lost=tuple(lost),
         diagnosis=diagnosis,
-        then=INSPECT if unmapped(workspace) else Situation(workspace, now).then,
+        then=Situation(workspace, now).then,
         better=better,
         since=since,
         adopted=adopted_rows(workspace),

@@ -22,21 +22,18 @@ from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
-from grounded.model import Model
 from grounded.result import UNSAID, Document, listed, number
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
-from grounded_trials.wording import rendered
 from grounded_trials.workspace.adopted import in_order, installed_effects, planner_of, settled
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import (
     newer_alone,
     read_diagnosis,
-    since_diagnosis,
 )
 from grounded_trials.workspace.new_target import to_plan
-from grounded_trials.workspace.readings import changed_since, last_again, taken_out, twice_in_time
+from grounded_trials.workspace.readings import taken_out, twice_in_time
 from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_keys
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
@@ -100,16 +97,11 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
     """Return the command that acts on the claims of a diagnosis, or None if there is none.
 
     Filters and delays of sensors are adopted too if states are fed back: feedback gains designed
-    without them make the robot oscillate. Nothing is adopted if [log] reads the trials in another
-    way now, or if they were all set aside: then their log is ingested again.
+    without them make the robot oscillate. Nothing is adopted if its trials were all set aside.
     """
-    made, trials = diagnosis.made, workspace.whole_trials()
-    here = {one.stored.id for one in trials}
+    made, here = diagnosis.made, {one.stored.id for one in workspace.whole_trials()}
     if made.trials and here.isdisjoint(made.trials):
-        aside = [one for one in workspace.aside_trials() if one.stored.id in made.trials]
-        return AGAIN if here else last_again(workspace, aside)
-    if changed_since(workspace, diagnosis, here) and (first := last_again(workspace, trials)):
-        return first
+        return AGAIN if here else None
     if diagnosis.changed:  # values of two robots together fit neither
         return newer_alone(diagnosis)
 
@@ -128,21 +120,6 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
         return AGAIN
 
     return NextCommand("adopt", (*new, *late))
-
-
-def not_adopted(workspace: Folder, diagnosis: Diagnosis | None) -> Finding | None:
-    """Return what the last diagnosis found that the model lacks, with the command, if anything.
-
-    Nothing is said of a diagnosis of another model, or if its effects were adopted and undone.
-    """
-    if diagnosis is None or since_diagnosis(workspace, diagnosis).changed:
-        return None
-    then, clauses = to_adopt(workspace, diagnosis), diagnosis.verdict.causes or diagnosis.effects
-    if then is None or then.verb != "adopt" or not clauses:
-        return None
-    command = rendered(then, workspace.address)
-    more = len(clauses) - 1
-    return found("plan.lacks", then=then, cause=clauses[0], more=more, command=command)
 
 
 def joined(
@@ -250,7 +227,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         if abs(e.value - old) > NO_CHANGE * max(abs(old), e.std)
     }
     called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(known.effects.values())}
-    told = [*_readings(workspace.base_model, [e for e in adopted if e["name"] in asked])]
+    told = list[Finding]()
     for name, e in left.items():
         was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
         told.append(found("model.not_told", called.get(name, name), kept=was, value=value))
@@ -317,21 +294,6 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
         then = NextCommand("adopt", diagnosis.effects or (rivals[0],))
         raise refused("model.not_adoptable", *rivals, why="rival", then=then)
     return not rivals
-
-
-def _readings(model: Model, effects: Effects) -> Iterator[Finding]:
-    """Yield which states are in readings of their sensors, once these effects are adopted."""
-    for effect in effects:
-        family, _, state = str(effect["name"]).partition(":")
-        size = effect.get("b", effect.get("k", 0.0))
-        way = "low" if size < 0 else "high"
-        if family == "sensor_bias":
-            bias = Quantity(abs(size), model.states[state])
-            yield found("model.readings", state, bias=bias, way=way, offset=-size)
-        elif family == "sensor_scale":
-            yield found("model.readings", state, by=abs(size), way=way)
-        elif family == "sensor_delay":
-            yield found("model.readings", *state.split("+"), age=Quantity(effect["d"], "s"))
 
 
 def undo_adoption(workspace: Folder) -> Adopted:

@@ -1,8 +1,4 @@
-"""Set trials aside, and choose the command to type next.
-
-The log of a trial is ingested again if [log] reads it in another way now, or should. After a run
-the search says what is next, usually to run its candidate again.
-"""
+"""Set trials aside; after a run the search says what is next, usually to run it again."""
 
 from __future__ import annotations
 
@@ -13,13 +9,10 @@ from dataclasses import dataclass, field, replace
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding
 from grounded.result import UNSAID, Document
-from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.proposing import status_of
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unknown_trial
-from grounded_trials.workspace.intake import COLUMNS
-from grounded_trials.workspace.readings import again, read_otherwise
 
 STATUS = NextCommand("status")
 
@@ -75,24 +68,5 @@ def discard_in(workspace: Folder, *trials: str, why: str = "") -> SetAside:
     """
     done = set_aside(workspace, "discard", trials, why)
     with suppress(GroundedError):  # of files that are damaged: `status` names them
-        if then := _instead(workspace, done.trials[-1]):
-            return replace(done, then=then)
+        return replace(done, then=status_of(workspace, standing_in(workspace)).then)
     return done
-
-
-def _instead(workspace: Folder, name: str) -> NextCommand | None:
-    """Return the command to type after a trial was discarded; None if `status` has to show it."""
-    from grounded_trials.workspace.intake.gone_wrong import Run  # slow to load
-
-    stored = workspace.store.find(name)
-    trial, meta, _ = read_trial(workspace.store.read(stored), stored.path.name)
-    if not workspace.fits(trial):
-        return None
-    if "source" in meta and (
-        read_otherwise(meta, workspace.log_mapping)
-        or any(one.code in COLUMNS for one in Run(workspace, trial).log_faults())
-    ):
-        own = standing_in(workspace).outstanding if trial.candidate else None
-        waits = own is not None and own.id == trial.candidate
-        return again(workspace, meta, trial.candidate, waits=waits)
-    return status_of(workspace, standing_in(workspace)).then if trial.candidate else None

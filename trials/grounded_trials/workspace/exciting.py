@@ -19,7 +19,7 @@ from grounded.search.noise import sensor_noise
 from grounded.task import MAX_HORIZON, Task
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.candidates.at_rest import resting
-from grounded_trials.workspace.candidates.first_plan import idle_inputs, no_effect
+from grounded_trials.workspace.candidates.first_plan import idle_inputs, no_effect, unlimited
 from grounded_trials.workspace.diagnosing import near, probe_candidate
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.next_step import to_run
@@ -127,8 +127,7 @@ def _bounded(workspace: Folder) -> Task:
     task = planner.plan.with_model(_as_known(workspace, planner.plan.model))
     if not task.model.uncertain:
         raise GroundedError(found("given.constant", str(workspace.config.model.file)))
-    ends = zip(task.model.input_names, task.low, task.high, strict=True)
-    if free := [name for name, *both in ends if not np.isfinite(both).all()]:
+    if free := unlimited(task):
         raise GroundedError(found("plan.no_limits", *free, weight=Weight.REFUSE))
     trials = [one for one in workspace.task_trials() if one.steps > 1]
     if trials:

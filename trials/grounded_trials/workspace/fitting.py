@@ -21,10 +21,10 @@ from grounded.findings import found as finding
 from grounded.fit import fit
 from grounded.result import Result
 from grounded_trials.workspace.adopted import settled
-from grounded_trials.workspace.adoption import keep, not_adopted
+from grounded_trials.workspace.adoption import keep, to_adopt
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import unsure_times
-from grounded_trials.workspace.last_diagnosis import chosen, readable_diagnosis
+from grounded_trials.workspace.last_diagnosis import chosen, readable_diagnosis, since_diagnosis
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.readings import one_message
@@ -131,13 +131,13 @@ def fit_in(
     if apply and found.worse:
         raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
-        lacks = not_adopted(workspace, readable_diagnosis(workspace.reports))
-        asks = lacks.then if lacks else None
+        # parameters alone stand for what the last diagnosis has found beside them
+        last = readable_diagnosis(workspace.reports)
+        stale = last is None or since_diagnosis(workspace, last).changed
+        asks = None if last is None or stale else to_adopt(workspace, last)
         own = {f"parameter:{name}" for name in workspace.base_model.params}
-        if lacks is not None and asks is not None and not own.issuperset(asks.arguments):
-            # parameters alone stand for what the last diagnosis has found beside them
-            told = replace(found, findings=(*found.findings, lacks))
-            return replace(fitted(applied=False, then=asks), fit=told)
+        if asks and asks.verb == "adopt" and not own.issuperset(asks.arguments):
+            return fitted(applied=False, then=asks)
         if not found.helps:
             return fitted(applied=False, then=after_fit(workspace))
         return fitted(applied=False, then=NextCommand("fit", (*asked, "--apply")))

@@ -34,7 +34,6 @@ from grounded_trials.workspace.identity import (
     StoredTrial,
     candidate_of,
     encoded,
-    named_apart,
     noted,
     sha256,
     unknown_candidate,
@@ -164,8 +163,7 @@ class Folder:
         lost = (
             replace(one, file=Path(one.file).name) for one in (*broken, *known.gone(self.store))
         )
-        trials = named_apart(found, known, self.candidate_path)
-        return trials, tuple(lost), errors
+        return tuple(found), tuple(lost), errors
 
     @cached_property
     def _decoded(self) -> dict[str, StoredTrial]:
@@ -367,16 +365,15 @@ class Folder:
         self, trials: tuple[StoredTrial, ...], lost: list[Lost], errors: list[GroundedError]
     ) -> Iterator[Candidate]:
         """Yield the search's candidates; a trial's copy replaces a damaged file."""
-        ran = {t.trial.candidate: (t.stored.id, t.ran) for t in trials if t.ran}
         for identity in self._ids(trials):
             file, why = f"candidates/{identity}.mcap", None
             for read in self._sources(identity, trials):
                 try:
                     data = read()
                     made, meta = candidate_of(data, identity)
-                    trial, known = ran.get(identity, ("", ""))
-                    if known and sha256(data) != known:
-                        raise refused("file.changed", file, what="policy", lost=trial)
+                    ran = (t for t in trials if t.trial.candidate == identity and t.ran)
+                    if trial := next((t for t in ran if t.ran != sha256(data)), None):
+                        raise refused("file.changed", file, what="policy", lost=trial.stored.id)
                 except GroundedError as error:
                     errors.append(why := error)
                     continue

@@ -2,8 +2,7 @@
 
 A policy is identified by the bytes of its file. Notes record the hashes of the files that were
 handed out under each name, so that rewritten files are found even with a valid checksum; they also
-record which trials were set aside. If two folders were merged and two policies are named c0002, the
-trials of the second count as data and get a name with the hash of what they ran: c0002~3f9a0c2d.
+record which trials were set aside.
 """
 
 from __future__ import annotations
@@ -14,7 +13,6 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -78,7 +76,7 @@ class StoredTrial:
         return sha256(self.policy) if self.policy else ""
 
     def changed(self, **about: Any) -> Self:
-        """Return it with another candidate or group."""
+        """Return it with another group."""
         trial, measured = (replace(each, **about) for each in (self.trial, self.measured))
         return replace(self, trial=trial, measured=measured)
 
@@ -90,9 +88,7 @@ class Noted:
     aside: dict[str, str] = field(default_factory=dict)  # discarded trial -> reason
     kept: set[str] = field(default_factory=set)  # trials that were discarded and restored
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
-    ran: dict[str, str] = field(default_factory=dict)  # trial without a policy -> SHA-256 of it
     hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
-    since: list[str] = field(default_factory=list)  # handed out since a trial was last set aside
     asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> the finding
     groups: dict[str, str] = field(default_factory=dict)  # trial -> the condition it was run in
 
@@ -125,16 +121,12 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
         kind = note["note"]
         if kind == "discard":
             found.aside[note["trial"]] = note["why"]
-            found.since.clear()
         elif kind == "restore":
             found.aside.pop(note["trial"], None)
             found.kept.add(note["trial"])
         elif kind == "hand-out":
             found.handed.setdefault(note["candidate"], set()).add(note["sha256"])
             found.hand_outs.append((note["candidate"], note["after"]))
-            found.since.append(note["candidate"])
-        elif kind == "run":
-            found.ran[note["trial"]] = note["sha256"]
         elif kind == "asked" and "finding" in note:
             found.asked[note["trial"]] = note["finding"]
         elif kind == "group":
@@ -148,40 +140,6 @@ _DECODED: dict[tuple[str, str], tuple[Candidate, dict[str, str]]] = {}  # by has
 def sha256(data: bytes) -> str:
     """Return the hash that identifies a candidate's file."""
     return hashlib.sha256(data).hexdigest()
-
-
-def named_apart(
-    trials: Sequence[StoredTrial], known: Noted, path_of: Callable[[str], Path]
-) -> tuple[StoredTrial, ...]:
-    """Rename the candidate of trials that ran another policy of the same name.
-
-    A name belongs to the policy in its file if that was run or handed out, else to the first policy
-    that was run under it.
-
-    Args:
-        trials: the trials, with the candidates' names in their files.
-        known: the notes.
-        path_of: returns the file of a candidate's name.
-
-    Returns:
-        The trials, in the same order.
-    """
-    prints = [one.ran or known.ran.get(one.stored.digest, "") for one in trials]
-    policies: dict[str, list[str]] = {}
-    for one, ran in zip(trials, prints, strict=True):
-        if one.trial.candidate and ran:
-            policies.setdefault(one.trial.candidate, []).append(ran)
-    own = {}
-    for name, several in policies.items():
-        path = path_of(name)
-        file = sha256(path.read_bytes()) if len({*several}) > 1 and path.is_file() else ""
-        own[name] = file if file in {*several, *known.handed.get(name, ())} else several[0]
-    return tuple(
-        one.changed(candidate=f"{one.trial.candidate}~{ran[:8]}")
-        if ran and ran != own.get(one.trial.candidate, ran)
-        else one
-        for one, ran in zip(trials, prints, strict=True)
-    )
 
 
 def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:

@@ -26,7 +26,6 @@ from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import named_trials, sha256
-from grounded_trials.workspace.readings import changed_since
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
@@ -142,7 +141,6 @@ class Since:
     adopted: tuple[str, ...] = ()  # effects that are part of the model now, claimed ones first
     missing: tuple[str, ...] = ()  # claimed effects that are not, if others are
     changed: bool = False  # the diagnosis was made with another model
-    reread: tuple[str, ...] = ()  # signals that [log] reads in another way now
     further: bool = False  # it left more to be found than it was allowed to claim
 
     @property
@@ -159,11 +157,10 @@ class Since:
     def findings(self) -> tuple[Finding, ...]:
         """Why the diagnosis is outdated; () if it is not."""
         only = self.changed and not self.adopted
-        if not (self.reread or self.newer or self.adopted or only):
+        if not (self.newer or self.adopted or only):
             return ()
         one = found(
             "search.outdated",
-            reread=self.reread,
             used=self.used if self.newer else None,
             usable=self.usable,
             adopted=self.adopted,
@@ -207,7 +204,6 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
         adopted=tuple(adopted),
         missing=missing if adopted else (),
         changed=not same or made.model not in ("", model_print(workspace)),
-        reread=changed_since(workspace, diagnosis, usable),
         further=diagnosis.verdict.again,
     )
 

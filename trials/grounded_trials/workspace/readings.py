@@ -1,29 +1,22 @@
 """How [log] reads the signals, and how it read those of the trials.
 
 The metadata of each trial records the keys of [log] by which its signals were read. A trial keeps
-its numbers when [log] is changed: what a diagnosis found in it may be due to what was corrected
-there since (`changed_since`), and its log has to be ingested again first.
+its numbers when [log] is changed: its log has to be discarded and ingested again.
 """
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from grounded.errors import NextCommand
 from grounded.findings import Finding as Said
 from grounded.findings import found as said
 from grounded.places import heading, position
-from grounded_trials.workspace.identity import READ_BY, StoredTrial
+from grounded_trials.workspace.identity import READ_BY
 
 if TYPE_CHECKING:
-    from grounded.diagnosis.parts import Diagnosis
     from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.workspace.folder import Folder
 
@@ -82,55 +75,6 @@ def paths_of(meta: Mapping[str, str], names: Sequence[str]) -> tuple[str, ...]:
     return found if len(found) == len(names) and all(found) else ()
 
 
-def read_otherwise(
-    meta: Mapping[str, str], mapping: LogMapping | None, corrected: Collection[tuple[str, str]] = ()
-) -> tuple[str, ...]:
-    """Return the signals of a trial that [log] reads in another way now.
-
-    Args:
-        meta: the trial's metadata.
-        mapping: the present [log].
-        corrected: signals with a key of theirs that may differ.
-    """
-    before, now = readings_of(meta), readings(mapping)
-
-    def same(name: str, was: Reading, one: Reading) -> bool:
-        keys = [key for key in NUMBERS if (name, key) not in corrected]
-        alike = all(np.isclose(getattr(was, key), getattr(one, key)) for key in keys)
-        return alike and was.path in ("", one.path)
-
-    return tuple(n for n, one in now.items() if n in before and not same(n, before[n], one))
-
-
-def changed_since(
-    workspace: Folder, diagnosis: Diagnosis, usable: Collection[str]
-) -> tuple[str, ...]:
-    """Return the signals that [log] reads otherwise than it did for a diagnosis, else ().
-
-    What the diagnosis corrected itself may have been written into [log] since. Once there is a
-    trial that was read by the present [log], the others were left as they are on purpose.
-    """
-    if not workspace.config.log.values:
-        return ()
-    in_log = [one for one in diagnosis.preflight if one.log]
-    corrected = {
-        (name, key)
-        for one in in_log
-        for name in one.signal.split("+")
-        for key in NUMBERS
-        if key in one.log
-    }
-    if any(one.kind == "delay" for one in in_log):  # maybe of another
-        corrected |= {(name, "delay_s") for name in workspace.base_model.state_names}
-    found: tuple[str, ...] = ()
-    for one in workspace.whole_trials():
-        if one.stored.id in usable and READ_BY in one.meta:
-            found = read_otherwise(one.meta, workspace.log_mapping, corrected)
-            if not found:
-                return ()
-    return found
-
-
 def one_message(workspace: Folder) -> tuple[str, ...]:
     """Return the states of a pose if one message holds them, else none.
 
@@ -142,33 +86,6 @@ def one_message(workspace: Folder) -> tuple[str, ...]:
         return ()
     topics = {mapping.states[name].path.partition(".")[0] for name in pose}
     return tuple(pose) if len(topics) == 1 else ()
-
-
-# ingesting a log again
-
-
-def again(
-    workspace: Folder, meta: Mapping[str, str], candidate: str, *, waits: bool = False
-) -> NextCommand:
-    """Return the command that ingests a trial's log again.
-
-    If its candidate waits for a trial, it needs no name: it is recognised, or the log is refused.
-    """
-    what = ("--candidate", candidate) if candidate else ("--data",)
-    return NextCommand("ingest", (_log_of(workspace, meta), *(what if not waits else ())))
-
-
-def last_again(workspace: Folder, trials: Sequence[StoredTrial]) -> NextCommand | None:
-    """Return the command that ingests the last foreign log among some trials again."""
-    foreign = [one for one in trials if "source" in one.meta]
-    return again(workspace, foreign[-1].meta, foreign[-1].trial.candidate) if foreign else None
-
-
-def _log_of(workspace: Folder, meta: Mapping[str, str]) -> str:
-    """Return the path of a trial's log if it is in or beside a folder in use, else LOG."""
-    home = workspace.folder.resolve()
-    places = (folder / Path(meta["source"]).name for folder in (Path.cwd(), home, home.parent))
-    return next((os.path.relpath(place) for place in places if place.exists()), "LOG")
 
 
 # delays that [log] takes out as well as the model

@@ -236,22 +236,12 @@ class Check:
         yield coasts_out(planner.task, planner.plan, planner.lift(made.predicted_run), held)
 
     def _became(self) -> Iterator[Finding]:
-        """Yield that it lost, that its trials were set aside, or those that it was made from."""
-        name, best = self.candidate.id, self.standing.incumbent
+        """Yield that its trials were set aside, or those that it was made from."""
+        name = self.candidate.id
         tried = next((t for t in self.standing.history if t.candidate.id == name), None)
         aside = self.workspace.discarded()
         if tried is not None and tried.void:
             yield disowned(tried, aside)
-        if tried is not None and tried.accepted is False and best is not None:
-            real = None if tried.crashed else tried.utility
-            yield found(
-                "plan.lost",
-                name,
-                candidate=name,
-                real=real,
-                best=best.candidate.id,
-                of=best.utility,
-            )
         for one in self.workspace.aside_trials():
             if one.trial.candidate == name:
                 told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)

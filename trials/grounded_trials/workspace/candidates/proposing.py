@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Weight, found, settle
+from grounded.findings import Finding, found, settle
 from grounded.result import Result
 from grounded.search.difference import in_question, last_gain
 from grounded.search.noise import known_noise, noise_cost, noise_missed
@@ -16,13 +16,11 @@ from grounded.search.standing import Phase
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates import trust
 from grounded_trials.workspace.candidates.handover import (
-    INSPECT,
     Void,
     check_log,
     checked_candidate,
     disowned,
     in_words,
-    unmapped,
 )
 from grounded_trials.workspace.candidates.search_state import (
     answered,
@@ -150,12 +148,12 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     check_log(workspace)
     if doubted := asked_about(workspace):  # who proposes goes on with it
         workspace.note(note="restore", trial=doubted[0].stored.digest, why="")
-    told, changed = bool(workspace.noted.since), [*filter(None, [overtaken(workspace, ran=True)])]
+    changed = [*filter(None, [overtaken(workspace, ran=True)])]
     proposal, void = _handed_over(workspace, tick)
     proposal = replace(proposal, standing=answered(workspace, proposal.standing))
     candidate, now = proposal.candidate, proposal.standing
     notes = [found("plan.void", name, candidate=name, why=why) for name, why in void.items()]
-    left = [] if told else _disowned(now, workspace.discarded())  # told when it was replaced
+    left = _disowned(now, workspace.discarded())
     if candidate is not None:
         notes = notes + left if not proposal.is_new else notes or left or changed
         notes = [one.also(instead=candidate.id) for one in notes]
@@ -163,14 +161,10 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.first_plan import left_open  # not for `status`
 
-        first = left_open(workspace, proposal)
+        first = [*left_open(workspace, candidate)]
         notes += first
     asked = next((one.then for one in first if one.then), None)
     status = status_of(workspace, now)
-    if candidate and status.diagnosis:
-        from grounded_trials.workspace.adoption import not_adopted
-
-        notes += [*filter(None, [not_adopted(workspace, status.diagnosis)])]
     if now.doubt and Situation(workspace, now, status.diagnosis).doubted:
         notes.append(now.doubt)
     if candidate is None:
@@ -290,14 +284,13 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         GroundedError: if a stored file is damaged.
     """
     standing = undecided(workspace, standing)
-    here, lost = Situation(workspace, standing), unmapped(workspace)
-    last, then = here.diagnosis, INSPECT if lost else here.then
+    here = Situation(workspace, standing)
+    last, then = here.diagnosis, here.then
     gone = () if standing.phase is Phase.PROPOSE else _disowned(standing, workspace.discarded())
     asked = asked_about(workspace)
     every = [
         *notes,
         *([asked[1]] if asked else []),
-        *([lost.weighing(Weight.NOTE)] if lost else []),
         *gone,
         *filter(None, [overtaken(workspace)]),
         *not_counted(uncounted(workspace, workspace.trials(), standing)),

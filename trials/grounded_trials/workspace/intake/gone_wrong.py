@@ -1,4 +1,4 @@
-"""Ask whether a run went as it should: sent or begun otherwise, reversed, astray, ended early.
+"""Ask whether a run went as it should: sent or begun otherwise, reversed, ended early.
 
 A motor wired the wrong way round, an encoder that slipped or a hand on the robot give a faultless
 log of a run that says nothing about its candidate. The next plan would be based on it. A log of
@@ -50,7 +50,6 @@ from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable
 
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
-STRAYED = 100.0  # the same, from where on a run went far astray
 NO_CRASH = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
 GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
 START_IS_OFF = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
@@ -162,7 +161,7 @@ class Run:
         return found("log.late", ran=self.own.id, steps=abs(late), side=side, what=what)
 
     def gone_wrong(self) -> Finding | None:
-        """Return what seems wrong with its motion: an input reversed, or a run far astray."""
+        """Return that an input seems reversed in its motion."""
         tried, run, missed, usual = self.tried, self.whole, 0.0, 1.0
         every = [t for t in self.history if t.utilities and math.isfinite(t.utility)]
         others = [t for t in every if t is not tried]
@@ -179,9 +178,6 @@ class Run:
             astray = missed > SIGN_ASKED_FROM * usual
             if turned := reversed_input(self.workspace.planner, run, astray=astray):
                 return self._is_it_wired(turned)
-        if tried and others and STRAYED * usual < missed < math.inf:
-            ran, times = tried.candidate.id, missed / usual
-            return found("run.astray", ran=ran, trial=self.trial.id, missed=missed, times=times)
         return None
 
     def _is_it_wired(self, turned: Finding) -> Finding:

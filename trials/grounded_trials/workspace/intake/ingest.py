@@ -35,19 +35,10 @@ from grounded_trials.workspace.candidates.search_state import (
     standing_of,
 )
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake import COLUMNS
 from grounded_trials.workspace.intake.gone_wrong import Run
-from grounded_trials.workspace.intake.opening.reading import (
-    NoneWaits,
-    Read,
-    read_own_trial,
-)
-from grounded_trials.workspace.intake.opening.stored_before import (
-    as_stored,
-    others_differ,
-    repeated,
-)
+from grounded_trials.workspace.intake.opening.reading import Read, read_own_trial
+from grounded_trials.workspace.intake.opening.stored_before import as_stored, repeated
 from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import ASIDE, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -128,12 +119,7 @@ def ingest_log(
     else:
         from grounded_trials.workspace.intake.opening.foreign import read_log_file
 
-        try:
-            read = read_log_file(workspace, path, candidate, data, sent_before)
-        except NoneWaits as error:
-            from grounded_trials.workspace.intake.recognise import best_run_again
-
-            read = best_run_again(workspace, path, error)
+        read = read_log_file(workspace, path, candidate, data, sent_before)
     # data, or commands that are the candidate's to the last digits: no other story is asked for;
     # of a foreign log it must be found where the run begins
     ran = read.trial.candidate
@@ -146,10 +132,6 @@ def ingest_log(
     before = repeated(workspace, path, read.trial, read.data)
     with ExitStack() as new:  # nothing is stored if judging the trial fails
         added = new.enter_context(workspace.store.adding(read.data, again=before != ""))
-        if read.bare:  # record which candidate file it ran
-            policy = sha256(workspace.candidate_bytes(ran))
-            note = {"note": "run", "trial": added.sha256[:DIGITS], "sha256": policy}
-            new.enter_context(workspace.notes.adding(note))
         if group:
             note = {"note": "group", "trial": added.sha256[:DIGITS], "group": group}
             new.enter_context(workspace.notes.adding(note, again=True))
@@ -206,7 +188,7 @@ def _circumstances(run: Run, read: Read, before: str, *, aside: bool) -> Iterato
     """
     workspace, now = run.workspace, run.now
     if before:
-        yield found("log.repeats", before, copy=others_differ(workspace))
+        yield found("log.repeats", before)
     if aside:
         waits = now.outstanding.id if now and now.outstanding else ""
         yield found("log.aside", run.trial.id, waits=waits)

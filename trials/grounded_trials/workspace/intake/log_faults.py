@@ -11,8 +11,6 @@ from collections.abc import Collection, Iterator
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
-
 from grounded.accounts.commands import clocks_apart
 from grounded.accounts.judge import contradicted, judge
 from grounded.accounts.reported import names_of, reported
@@ -20,14 +18,11 @@ from grounded.accounts.sent import follows, latest
 from grounded.accounts.table import Account, Told
 from grounded.findings import Finding, found
 from grounded.share import STEPS
-from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.intake import COLUMNS
 from grounded_trials.workspace.last_diagnosis import diagnosable
 from grounded_trials.workspace.readings import paths_of, read_by
-
-COVER = 0.9  # share of the largest command in a log that [limits] in its unit must reach
 
 
 def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[Finding, ...]:
@@ -78,24 +73,7 @@ def _mended(workspace: Folder, known: Trial, one: Finding, *, own: bool) -> Find
         units = {**task.model.states, **task.model.inputs}
         writes = tuple(dict.fromkeys(units[name] for name in one.about))
         return one.also(tables=(), writes=writes, **facts)
-    facts["limits"] = tuple(_limits(task, known, one)) if one.code == "log.unit" else ()
     return one.also(**facts)
-
-
-def _limits(task: Task, known: Trial, one: Finding) -> Iterator[str]:
-    """Yield the values to write for [limits] that are in the same wrong unit as a log's inputs.
-
-    They reach as far as the wrong log; if the inputs are too small, not as far as the right one.
-    """
-    by = one.facts["by"]
-    assert isinstance(by, float)
-    for name in (name for name in one.about if name in task.model.inputs):
-        j = known.input_names.index(name)
-        ends, largest = (task.low[j], task.high[j]), np.abs(known.inputs[:, j]).max(initial=0.0)
-        most, needed = max(map(abs, ends)), COVER * largest / min(1 / abs(by), 1.0)
-        if np.isfinite(most) and (most >= needed) == (abs(by) < 1):
-            low, high = (f"{end * abs(by):.4g}" for end in ends)
-            yield f"{name} = [{low}, {high}]"
 
 
 def not_the_logs(

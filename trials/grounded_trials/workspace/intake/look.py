@@ -103,8 +103,6 @@ def elsewhere(log: Recording, start: Start, policy: Policy, *, why: bool) -> boo
     The first command of a busy computer may be late. If the run began with it, all others would be
     early, and would be compared with states that the program did not have yet.
     """
-    if start.missed or (start.between_rows and start.alike):
-        return True
     off = abs(start.seconds - log.first)
     if not start.opens_alike or off <= ALIGNED * log.interval:
         return start.alike and off > LOOSE * log.dt and not log.late.any()

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property
 from operator import attrgetter
@@ -38,15 +37,13 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.search.candidate import Candidate
 from grounded.task import Task
-from grounded.trial import Trial, interpolate_gaps
+from grounded.trial import interpolate_gaps
 from grounded_trials.logs.log_table import misread
-from grounded_trials.wording import with_unit
-from grounded_trials.workspace.candidates.search_state import latest_candidates, standing_in
+from grounded_trials.workspace.candidates.search_state import latest_candidates
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task, sha256
 from grounded_trials.workspace.intake.log_faults import column_faults, not_the_logs
 from grounded_trials.workspace.intake.look import (
-    LOOSE,
     elsewhere,
     fall_in,
     sender_of,
@@ -54,45 +51,15 @@ from grounded_trials.workspace.intake.look import (
 from grounded_trials.workspace.intake.opening.foreign import (
     cut_log,
     cut_short,
-    read_log_file,
 )
-from grounded_trials.workspace.intake.opening.reading import NoneWaits, Read
+from grounded_trials.workspace.intake.opening.reading import Read
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 
 if TYPE_CHECKING:
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
 
 WHOLE = 0.9  # share of a run that a log must last to be one, or else the error says so
-ENDED = ("stopped", "converged")  # phases of a search
 SHORTER = 1.0  # [nats] that a fall costs
-
-
-def best_run_again(workspace: Folder, path: Path, error: NoneWaits) -> Read:
-    """Return a log as another run of the best candidate, if the search ended and it clearly is one.
-
-    Raises:
-        GroundedError: `error` if not, with the command that fits the log: the best, another
-            candidate, or data.
-    """
-    if not error.best:
-        read = read_log_file(workspace, path, None, True)
-        log = read.log.recording if read.log else None
-        if earlier := of_earlier_task(workspace, log, read.trial):
-            raise _of_earlier(workspace, str(path), earlier.names[0])
-        raise error
-    try:
-        read = read_log_file(workspace, path, error.best, False)
-        seen = recognised(workspace, path, read, None)
-    except GroundedError as refused:
-        if refused.finding.code == "log.earlier":
-            raise
-        raise GroundedError(str(error), refused.then) from None
-    doubts = [one for one in seen.findings if one not in read.findings]  # where it begins, whose
-    if any(one.weight is not Weight.NOTE for one in doubts):
-        raise error
-    if standing_in(workspace, ahead=True).phase not in ENDED:
-        raise error
-    return read.telling(found("log.again", ran=error.best))
 
 
 class Case:
@@ -113,7 +80,7 @@ class Case:
         candidates, earlier = latest_candidates(workspace, OTHERS)
         shape = attrgetter("dt", "horizon", "state_names", "input_names")
         self.earlier = [one for one in earlier if shape(one.policy) == shape(self.own.policy)]
-        self.rivals, self.exact = [*self.earlier, *candidates], False
+        self.rivals = [*self.earlier, *candidates]
         self.found: Start | None = None
         # set if judged on other samples than stored
         self.apart = None if log is read.log else log
@@ -149,7 +116,6 @@ class Case:
         """Cut the run where it begins in the log; return whose it is then."""
         self.found = start = self.start_of(self.own)
         sender = sender_of(log, self.own, self.rivals, self.start_of)
-        self.exact = sender.own is not None and sender.own.exact
         if start and elsewhere(log, start, self.own.policy, why=bool(seen.why)):
             self._cut(stored, start)
             seen = self._judged()
@@ -173,11 +139,6 @@ class Case:
             begins += (self.log.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
         self.read = replace(cut_log(stored, self.ran, begins), before=self.read.before)
         self.read = self.read.telling(*kept)
-        if start.missed:
-            pairs = zip(self.task.model.inputs.items(), self.task.past, strict=True)
-            held = tuple(with_unit(f"{name} = {value:g}", unit) for (name, unit), value in pairs)
-            missed = found("run.missed", ran=self.ran, steps=start.missed, held=held)
-            self.read = self.read.telling(missed)
         cut = self.apart.cut(self.ran, start.seconds)[0] if self.apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
 
@@ -213,20 +174,6 @@ class Case:
         """Whether commands are 0 throughout, though the plan moves them."""
         return self.seen.why is not None and self.seen.why.code == "log.silent"
 
-    def warned(self) -> Read:
-        """Return the trial with what is doubtful about where it begins, or about its samples."""
-        read, start = self.read, self.found
-        if read.log and read.cut:  # states may be unknown when the run begins
-            read.log.refuse_late(read.cut)
-        if start and start.alike:
-            if start.loose_s > LOOSE * self.task.dt and not self.exact:
-                loose = Quantity(start.loose_s, "s")
-                read = read.telling(found("log.start_loose", ran=self.ran, loose=loose))
-            if start.rival_s is not None:
-                doubt = found("log.start_doubt", ran=self.ran, used=start.seconds)
-                read = read.telling(doubt.also(rival=start.rival_s))
-        return read
-
 
 def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None) -> Read:
     """Refuse a log whose commands are not its candidate's; only warn if the user named a candidate.
@@ -252,7 +199,9 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         logs.append(late)
     cases = [Case(workspace, path, read, log) for log in logs]
     case = min(cases, key=lambda one: one.doubt)
-    read, fell = case.warned(), case.fell
+    read, fell = case.read, case.fell
+    if read.log and read.cut:
+        read.log.refuse_late(read.cut)
     stored = read.log.stored if read.log else ()
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell[0]) if fell and fell[0] in accepted else read
@@ -284,8 +233,6 @@ def _of_log(case: Case) -> Iterator[Story]:
         yield from stories_of_log(log, task, own, case.found)
     if dead := [one for one in case.columns if one.code == "log.dead"]:
         yield replace(next(_of_columns(case, dead)), commands=-np.inf)
-    if earlier := of_earlier_task(case.workspace, log, case.whole):
-        yield earlier
 
 
 def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | None) -> list[Story]:
@@ -303,7 +250,7 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
     at = [*([start.seconds] if start else []), log.first, *log.openings[:TRIED]]
     how: dict[str, Any] = {"logged": log.measured, "waits": log.waits}
     some = list[Story]()
-    for begins in dict.fromkeys(log.on_step(own.policy, one)[0] for one in at):
+    for begins in dict.fromkeys(log.on_step(own.policy, one) for one in at):
         if trial := log.trial_from(begins):
             run = trial.until(min(trial.finite_steps, task.horizon))
             some += stories(task, own, run, follows(own.policy, run, latest(task)), **how)
@@ -336,7 +283,7 @@ def _of_columns(case: Case, odd: Sequence[Finding]) -> Iterator[Story]:
 
 def _doubted(case: Case, read: Read, story: Story) -> Read:
     """Return the run of a candidate that the user named, with what is doubtful about it."""
-    log, ran, task = case.log, case.ran, case.task
+    log = case.log
     by_hand = log and not (case.opens or case.rival or case.silent)
     nobody = by_hand and case.seen.ran and not case.seen.ran.opens
     nobody = nobody and story.kind in (Kind.UNKNOWN, Kind.LOG)
@@ -344,10 +291,7 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
     assert story.finding is not None
     doubts = [story.finding.weighing(Weight.ASIDE if aside else Weight.WARN)]
     if log and not case.opens:
-        read, assumed = _from_first_change(read, log, task)
-        run = task.horizon * task.dt
-        longer = _lasting_s(log) - run if WHOLE * _lasting_s(log) > run else 0.0
-        doubts.append(found("log.start_assumed", ran=ran, at=assumed, longer=longer))
+        doubts.append(found("log.start_assumed", ran=case.ran, at=log.first))
     return replace(read.telling(*doubts), doubted=True)
 
 
@@ -402,20 +346,6 @@ def _refusal(case: Case, story: Story) -> GroundedError:
     return GroundedError(told.also(where=path).weighing(Weight.REFUSE), then)
 
 
-def _from_first_change(read: Read, log: Recording, task: Task) -> tuple[Read, float]:
-    """Cut a run of unknown start where the commands first change, if a whole run follows.
-
-    Returns:
-        The run, and where it begins, in seconds after the log's first sample.
-    """
-    changes, run = log.changes[log.changes > log.first], task.horizon * task.dt
-    begins = float(changes.min(initial=np.inf))
-    late = begins - log.first
-    if read.log is None or not task.dt <= late <= _lasting_s(log) - WHOLE * run:
-        return read, log.first
-    return cut_log(read.log, read.trial.candidate, begins), begins
-
-
 def _lasting_s(log: Recording) -> float:
     """Return how long a log lasts after its first command [s]."""
     end = min(int(one.t.max()) for one in log.logged.values())
@@ -427,28 +357,3 @@ def _of_earlier(workspace: Folder, path: str, ran: str) -> GroundedError:
     was = other_task(workspace.task, workspace.candidate(ran)[0])
     told = found("log.earlier", path, ran=ran, was=was)
     return GroundedError(told, NextCommand("ingest", (path, "--data")))
-
-
-def of_earlier_task(workspace: Folder, log: Recording | None, trial: Trial) -> Story | None:
-    """Return that a candidate of an earlier task sent the commands of a trial, or None.
-
-    Args:
-        workspace: the workspace with the candidates.
-        log: the foreign log of the trial, in which a run may begin anywhere; else None.
-        trial: the trial, with gaps bridged.
-    """
-    task, void = workspace.task, list[Candidate]()
-    for identity in workspace.candidate_ids():
-        with suppress(GroundedError):  # a damaged file can't have been run
-            candidate, meta = workspace.candidate(identity)
-            void += [candidate] * (meta.get("task") != task.hash)
-    some = list[Story]()
-    for one in reversed(void[-OTHERS:]):
-        start = log.start_of(one.policy) if log else None
-        fit = None if log else follows(one.policy, trial.until(one.policy.horizon), latest(task))
-        error = start.apart if start and start.alike else fit.error if fit and fit.alike else SMALL
-        if error < SMALL:
-            run = (log.trial_from(start.seconds) if log and start else None) or trial
-            told = found("log.earlier", ran=one.id, was=other_task(task, one))
-            some.append(scored(Kind.EARLIER, told, one, run, error, names=(one.id,)))
-    return min(some, key=lambda one: one.commands, default=None)

@@ -48,7 +48,6 @@ class Read:
     trial: Trial
     data: bytes
     findings: tuple[Finding, ...] = ()
-    bare: bool = False  # it ran a candidate but contains no copy of it
     doubted: bool = False  # ingested as a candidate's run although its commands differ
     # the trial that was made from the log before and is set aside
     before: StoredTrial | None = None
@@ -114,7 +113,7 @@ def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: b
         raise refused("log.another", where=str(path), ran=candidate, other=trial.candidate)
     if trial.candidate:
         check_candidate(workspace, path, trial.candidate, meta.get("task", ""), policy)
-        return Read(trial, content, bare=policy is None)
+        return Read(trial, content)
     trial = replace(trial, candidate=candidate or outstanding(workspace, path))
     check_candidate(workspace, path, trial.candidate)
     return Read(trial, encode(workspace, trial, about(workspace, trial.candidate)))
@@ -148,19 +147,12 @@ def check_candidate(
         raise refused("log.earlier", path, ran=candidate, what="policy")
 
 
-class NoneWaits(GroundedError):
-    """Raised if no candidate is waiting for a trial; `best` may have been run again."""
-
-    def __init__(self, workspace: Folder, path: Path, best: str) -> None:
-        super().__init__(none_waits(workspace, str(path), best))
-        self.best = best if self.finding.code == "search.none_waits" else ""
-
-
 def outstanding(workspace: Folder, path: Path) -> str:
     """Return the candidate that waits for a trial, or raise that none does."""
     now = standing_in(workspace)
     if now.outstanding is None:
-        raise NoneWaits(workspace, path, now.incumbent.candidate.id if now.incumbent else "")
+        best = now.incumbent.candidate.id if now.incumbent else ""
+        raise GroundedError(none_waits(workspace, str(path), best))
     return now.outstanding.id
 
 

@@ -7,10 +7,6 @@ logged from there on. The result is refined to the instants at which commands ch
 ends before the run would have, it is compared as far as it goes, provided that the commands were
 constant before.
 
-A table shows a new command only with the first row after its change, up to one row late: at 2 m/s
-and 100 Hz that is 2 cm. Feedback determines when within that row the run began, since the commands
-respond to where the robot was then.
-
 A controller acts on the last sample that reached it, which is older than the latest one in the log:
 20 ms of transport and sampling change a command by 5 %, more than most candidates differ by. So the
 commands of each candidate are computed from the samples of the age that fits best, separately for
@@ -29,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.levels import EXACT as TO_DIGITS
-from grounded.accounts.levels import FINE, HALF, PART, SLIGHT, SMALL, STEPS_TO_JUDGE
+from grounded.accounts.levels import FINE, HALF, SLIGHT, STEPS_TO_JUDGE
 from grounded.accounts.sent import (
     WINDOWS,
     follows,
@@ -51,12 +47,8 @@ AGES_BETWEEN = 8  # number of ages tried in the time between samples
 ROUNDS = 2  # rounds of coordinate search over the topics' ages
 FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
 TRIED = 5  # number of best-fitting instants that are examined
-MISSED = 5  # largest number of first steps that may not have been sent
 HELD = 3.5  # steps without a change of commands before an instant that may begin a run
 FINEST = 8  # largest number of instants per step at which a start is tried
-KNOWN = 0.25  # largest std, in rows, with which feedback determines the start within a row
-EXACT = 0.1  # share of the effect of a late row below which the logged states were the policy's
-SOUGHT = 24  # number of instants at which samples of different ages are tried
 QUIET_S = 1.0  # time without a change of commands before a run that is cut short in the log
 LOGGED_PART = 4  # at least 1 / LOGGED_PART of a run must be in the log
 BATCH = 256  # instants compared at once
@@ -70,11 +62,7 @@ class Start:
     apart: float  # mean difference of the commands there, in units of each input's size
     alike: bool  # the commands are the policy's from there on
     opens_alike: bool  # at least the first commands are; somebody may have taken over later
-    between_rows: bool = False  # determined by feedback, finer than the time between rows
-    loose_s: float = 0.0  # uncertainty of the start [s]
-    missed: int = 0  # steps of the run before the first command, which were not sent
     exact: bool = False  # most commands are the policy's to the last digits, and no part is not
-    rival_s: float | None = None  # another start, far from it, that fits about as well
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,9 +135,7 @@ class Recording:
             few = np.where(strays < 0.5, strays, np.inf)
             begun = [one for one in self._starts(policy, few) if one.opens_alike]
             found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
-        if found is None or not found.alike:
-            found = self._by_its_samples(policy, strays) or found
-        return self._before_first(policy, found) or found
+        return found
 
     def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
         """Choose among likely starts where most commands are the policy's; None if there is none.
@@ -169,66 +155,11 @@ class Recording:
         told = [(fit, one) for fit, one in fits if fit is not None and fit.enough]
         fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
         if fit is not None and fit.throughout:
-            rival = self._rival(best, [one for fit, one in told if fit.throughout])
-            return replace(best, alike=True, opens_alike=True, exact=True, rival_s=rival)
+            return replace(best, alike=True, opens_alike=True, exact=True)
         usual = next((other.left for other, one in told if one is likeliest), 0.0)
         if fit is not None and alike and fit.left < HALF * usual:
             return replace(best, opens_alike=True)
-        return replace(likeliest, rival_s=self._rival(likeliest, near)) if alike else None
-
-    def _rival(self, found: Start, others: Sequence[Start]) -> float | None:
-        """Return the likeliest of the other starts far from the one found [s], or None."""
-        apart = [
-            one for one in others if abs(one.seconds - found.seconds) > STEPS_TO_JUDGE * self.dt
-        ]
-        return min(apart, key=lambda one: one.apart).seconds if apart else None
-
-    def _by_its_samples(self, policy: Policy, strays: Array) -> Start | None:
-        """Find where the first commands are the policy's to the last digits, on samples of any age.
-
-        This finds runs with high gains, whose commands change completely if a state is a
-        millisecond older, and runs that failed early.
-        """
-        first = least_of(policy.horizon)
-
-        def off(at: float) -> float:
-            """Return the median difference of the first commands; infinite if they don't move."""
-            fit = acted_on(self, policy, at)
-            told = np.zeros(0, int) if fit is None else np.flatnonzero(fit.told[:first])
-            if fit is None or len(told) < STEPS_TO_JUDGE:
-                return np.inf
-            moves = bool((np.ptp(fit.asked[told], axis=0) > SMALL * fit.size).any())
-            return float(np.median(fit.off[told])) if moves else np.inf
-
-        tried, left = dict[float, float](), strays.copy()
-        while len(tried) < SOUGHT and np.isfinite(left).any() and policy.gain is not None:
-            k = int(np.argmin(left))
-            left[max(0, k - self.parts + 1) : k + self.parts] = np.inf
-            at, _ = self.on_step(policy, self.first + k * self.dt / self.parts)
-            tried[at] = off(at)
-        best = min(tried, key=tried.__getitem__, default=0.0)
-        if not tried or tried[best] > TO_DIGITS:
-            return None
-        return Start(best, self.apart_at(policy, best), alike=False, opens_alike=True)
-
-    def _before_first(self, policy: Policy, found: Start | None) -> Start | None:
-        """Return a start before the first command, if the first steps were not sent; or None.
-
-        A program whose timer fires late skips step 0, as the runner does for missed calls. Taken as
-        step 0, each command is compared with the gains and reference of its neighbour, and may
-        still look alike. The commands that were sent tell, with the input held before the others.
-        """
-        first, _ = self.on_step(policy, self.first)
-        usual = acted_on(self, policy, found.seconds if found else first)
-        if usual is not None and usual.exact:
-            return None
-        misfits = [self._misfit(policy, first - k * self.dt) for k in range(1, MISSED + 1)]
-        missed = int(np.argmin(misfits)) + 1
-        at = first - missed * self.dt
-        there, least = acted_on(self, policy, at), PART * (usual.left if usual else 0.0)
-        if there is None or there.told.sum() < STEPS_TO_JUDGE or there.left > max(least, TO_DIGITS):
-            return None
-        return Start(at, found.apart if found else np.inf, True, True, missed=missed)
+        return likeliest if alike else None
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
         """Return the likeliest starts, by the difference of the commands from each instant on."""
@@ -236,15 +167,13 @@ class Recording:
         while len(found) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
             left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
-            on_step, room = self.on_step(policy, self.first + k * self.dt / self.parts)
-            seconds, loose = self._between_rows(policy, on_step, room)
+            seconds = self.on_step(policy, self.first + k * self.dt / self.parts)
             trial = self.trial_from(seconds)
             fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
             if trial is not None and fit is not None:
                 alike = fit.alike and not fit.late
                 opens = alike or fit.opens
-                between = seconds < on_step
-                found.append(Start(seconds, float(apart[k]), alike, opens, between, loose))
+                found.append(Start(seconds, float(apart[k]), alike, opens))
         return found
 
     def apart_at(self, policy: Policy, start: float) -> float:
@@ -254,18 +183,18 @@ class Recording:
             return np.inf
         return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
 
-    def on_step(self, policy: Policy, start: float) -> tuple[float, float]:
-        """Move a start by less than a step to where commands change; return its uncertainty too."""
+    def on_step(self, policy: Policy, start: float) -> float:
+        """Move a start by less than a step to where commands change."""
         dt, length = self.dt, self.dt * policy.horizon
         inside = (self.changes > start - dt / 2) & (self.changes < start + length)
         late = self.late[inside]
         if (found := phase_of(self.changes[inside] - start, dt, late)) is None:
-            return start, float(np.median(late)) if len(late) else 0.0
-        phase, room = found
+            return start
+        phase, _ = found
         if abs(phase) < dt / 4:
-            return start + phase, room
+            return start + phase
         tried = [start + phase + move * dt for move in (-1, 0, 1)]
-        return min(tried, key=lambda at: self._misfit(policy, at)), room
+        return min(tried, key=lambda at: self._misfit(policy, at))
 
     def _misfit(self, policy: Policy, start: float) -> float:
         """Return the mean difference of the commands from a start on, in units of their size."""
@@ -276,42 +205,6 @@ class Recording:
         sent = np.clip(trial.inputs[:lasting], policy.low, policy.high)
         asked = policy.commands(trial.states[None, :lasting], policy.past)[0]
         return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
-
-    def _between_rows(self, policy: Policy, start: float, row: float) -> tuple[float, float]:
-        """Move a start back by less than a row, to where the feedback commands fit best.
-
-        Args:
-            policy: the policy.
-            start: the start [s].
-            row: the remaining uncertainty from the changes of the commands [s].
-
-        Returns:
-            The start [s], and its uncertainty [s]: `row` if the commands do not follow from the
-            logged states at any time within the row, else 0.
-        """
-        if policy.gain is None or not row:
-            return start, 0.0
-        late, early = self.trial_from(start), self.trial_from(start - row)
-        if late is None or early is None:
-            return start, 0.0
-        T = min(late.finite_steps, early.finite_steps, policy.horizon)
-        if T < STEPS_TO_JUDGE:
-            return start, 0.0
-        states = np.stack([late.states[:T], early.states[:T]])
-        asked, before = policy.commands(states, policy.past)
-        sent = np.clip(late.inputs[:T], policy.low, policy.high)
-        unit = np.abs(policy.feedforward).max(axis=0) + 1e-12
-        free = (asked > policy.low) & (asked < policy.high)
-        slope, off = (((v - asked) / unit)[free] for v in (before, sent))
-        power = float(slope @ slope)
-        if not power:
-            return start, 0.0
-        share = float(slope @ off) / power
-        left = float(((off - share * slope) ** 2).mean())
-        loose = row if left * len(off) > EXACT**2 * power else 0.0
-        if left > KNOWN**2 * power or not -KNOWN < share < 1 + KNOWN:
-            return start, loose
-        return start - float(np.clip(share, 0.0, 1.0)) * row, loose
 
 
 def recording(

@@ -14,7 +14,7 @@ import numpy as np
 
 from grounded.checks import refused
 from grounded.errors import NextCommand
-from grounded.trial import Trial, scattered
+from grounded.trial import Trial
 from grounded_trials.logs.log_paths import log_files, on_disk
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -113,9 +113,3 @@ def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
     written = max(file.stat().st_mtime_ns for file in files)
     fresh = written > known[-1].path.stat().st_mtime_ns
     return known[-1].id if fresh and waiting and waiting.id == trial.candidate else ""
-
-
-def others_differ(workspace: Folder) -> bool:
-    """Return whether other trials of one candidate differ, so that an exact repeat is a copy."""
-    ran = [trial for trial in workspace.task_trials() if trial.candidate]
-    return bool(scattered([trial.whole(workspace.task.horizon) for trial in ran]))
