@@ -248,10 +248,8 @@ START: dict[str, Entry] = {
         "[[empty? there are no messages: record the commands]]",
     ),
     "left": note(
-        "no name matches; {numbers} {numbers:is/are} left[[only? , by unit]][[!only? , in the "
-        "log's order]]",
+        "no name matches; {numbers} {numbers:is/are} left[[only? , by unit]]",
     ),
-    "steps": note("with it the model's steps fit {share:%} better than the next best"),
     "given": note("as you specified"),
     "unused": note("{about} {about:is/are} not used of the log: [log] can name {about:it/them}"),
     "angles": note(

@@ -172,7 +172,7 @@ RIGHT = {
 
 @pytest.mark.parametrize("joint, th", [("trolley", "th"), ("trolley", "beta"), ("axis_1", "beta")])
 def test_a_trolley_and_its_load_are_told_apart(tmp_path, joint, th):
-    """By names and units where they say it, by the model's steps where they don't."""
+    """By names and units where they say it, by their rates where they don't."""
     (tmp_path / "mine.py").write_text(CRANE.format(th=th))
     log = crane_bag(tmp_path / "bag", joint)
     found = begin(tmp_path / "w", log, model=tmp_path / "mine.py")

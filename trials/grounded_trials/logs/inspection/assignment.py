@@ -6,9 +6,7 @@ Every number has points for every role, the sum of named evidence:
     unit        stated by the log, or by the ROS message type              (`stated_units`)
     kind        a command for an input, what is measured for a state; a number that changes
     joint       the names and the order of joints                          (`joint_names`)
-    home        states come from one message rather than from many, and often
     derivative  where the model has dq/dt = w, w follows q in the samples  (`relations`)
-    motion      the model's steps, of inputs that are left                (`relations`)
 
 `linear_sum_assignment` takes the assignment of most points, so that no guess overwrites another.
 What leads its rivals by `SURE_LEAD` and rests on more than one unit or an order is sure; the rest
@@ -17,7 +15,6 @@ is listed. A role that no name fits gets a number only if as many fit as there a
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -47,7 +44,6 @@ from grounded_trials.logs.inspection.relations import (
     SURELY,
     Follows,
     Signals,
-    by_inputs,
     follows,
 )
 from grounded_trials.logs.stated_units import (
@@ -63,7 +59,7 @@ LEAD = 0.75  # lead of a number without a name over those that fit worse
 MOST_CANDIDATES = 20  # largest number of candidates
 UNNAMED = 60  # most numbers without a name that are tried as rates
 LATEST = 0.5  # [s] a command is sought up to this long before the angle that follows it
-STATED, HOME, CAP = 1.8, 0.75, 5.0  # points, see `_Table`
+STATED, CAP = 1.8, 5.0  # points, see `_Table`
 
 
 @dataclass(frozen=True)
@@ -117,12 +113,9 @@ def assigned(
         table.add(name, path, 2 * CAP)
         table.named.add((name, path))
     table.look()
-    guesses = table.solved(by_order=not given)
+    guesses = table.solved(named=bool(given))
     for pair in table.rates.items():
         guesses |= _followed(guesses, pair, table)
-    if model is not None:
-        table.signals.read(p for g in guesses.values() for p in (g.path, *g.others) if p)
-        guesses |= by_inputs(model, guesses, table.signals)
     done = [table.finished(guess) for guess in guesses.values()]
     return tuple(done[: len(states)]), tuple(done[len(states) :])
 
@@ -173,7 +166,6 @@ class _Table:
             for number in self.numbers:
                 self._by_itself(role, number, called)
         self._by_joints()
-        self._at_home()
 
     def add(self, name: str, path: str, points: float, *why: Finding) -> None:
         """Add evidence for a number in a role."""
@@ -192,29 +184,24 @@ class _Table:
             self.add(role.name, number.path, name + self._unit(role, number) + kind)
 
     def _name(self, role: _Role, number: _Number, called: Sequence[str]) -> float:
-        """Return the points of a name, fewer for numbers that tell little; 0 if none fits."""
+        """Return the points of a name, fewer for a number that stays the same; 0 if none fits."""
         topic, one = number.topic, number.field
         points = words.name_points(called, role.name, topic, one, is_input=role.sent)
-        if not points:
-            return 0.0
-        self.named.add((role.name, number.path))
-        points -= 3.0 * (one.low is None) + 2.0 * (one.not_finite > 0.1 * topic.messages)
-        return points - 1.0 * (not number.moves) - 1.0 * (topic.messages < 3)
+        if points:
+            self.named.add((role.name, number.path))
+        return points and points - 1.0 * (not number.moves)
 
     def _unit(self, role: _Role, number: _Number) -> float:
         """Return the points of a unit, stated by the log or known by convention."""
-        points = -1.5 * (role.unit in LENGTHS and is_angle(number.path))
         unit, fits = number.said or number.known, self._fits(role, number)
         if role.unit in ("", "1"):
-            return points + STATED * bool(number.said and role.unit) * fits
+            return STATED * bool(number.said and role.unit) * fits
         if not unit:
-            return points
+            return 0.0
         why = found("start.unit", role.name, unit=unit, model=None if fits else role.unit)
         self.add(role.name, number.path, 0.0, why)
-        if not fits and not number.said:
-            self.doubted.add((role.name, number.path))
-        other = -0.5 if number.said else -1.5 if role.sent else -CAP  # of another sensor
-        return points + ((STATED if number.said else 0.5) if fits else other)
+        other = -1.5 if number.said or role.sent else -CAP  # of another sensor
+        return (STATED if number.said else 0.5) if fits else other
 
     def _fits(self, role: _Role, number: _Number) -> bool:
         return factor_between(number.said or number.known, role.unit) is not None
@@ -238,20 +225,6 @@ class _Table:
             if one.points >= NAMED - SURE_LEAD:
                 self.named.add((name, path))
 
-    def _at_home(self) -> None:
-        """Count that states come from one message, and often."""
-        fitting = {role.name: self._fitting(role.name) for role in self.roles if not role.sent}
-        homes = Counter(t for some in fitting.values() for t in {n.topic.topic for n in some})
-        for name, numbers in fitting.items():
-            for topic, path in [(n.topic, n.path) for n in numbers]:
-                rate = 0.1 * float(np.log10(1 + topic.rate_hz))
-                self.add(name, path, HOME * homes[topic.topic] + rate)
-
-    def _fitting(self, name: str) -> list[_Number]:
-        """Return the numbers that would be proposed for a role."""
-        row = self.points[self.row[name]]
-        return [number for number in self.numbers if row[self.at[number.path]] >= POINTS_TO_PROPOSE]
-
     def factor(self, name: str, path: str) -> float:
         """Return the factor from the unit that the log states for a number to a role's."""
         return self.stated.factor(path, self.units[name])
@@ -261,9 +234,7 @@ class _Table:
         from scipy.optimize import linear_sum_assignment
 
         roles, numbers = self.points.shape
-        order = np.outer(np.arange(roles), np.arange(numbers)) - roles * np.arange(numbers)
-        gain = self.points + 1e-6 * order  # ties go in the log's order
-        gain = np.where(self.points >= POINTS_TO_PROPOSE, gain, -1e6)
+        gain = np.where(self.points >= POINTS_TO_PROPOSE, self.points, -1e6)
         rows, columns = linear_sum_assignment(
             np.hstack([gain, np.zeros((roles, roles))]), maximize=True
         )
@@ -289,11 +260,10 @@ class _Table:
         """Count how well candidates for a rate follow those for its position."""
         q, w = pair
         taken = {path for name, path in first.items() if name not in pair}
-        sent = {path for name, path in first.items() if self.roles[self.row[name]].sent}
         free = [n for n in self.numbers if n.moves and n.path not in taken]
 
         # What a name fits, else what is free, if that is little.
-        own = {name: [p for p in self._near(name) if p not in sent] for name in pair}
+        own = {name: self._near(name) for name in pair}
         bare = [name for name in pair if not own[name]]
         if len(free) <= UNNAMED:
             own |= {name: self._possible(name, free) for name in bare}
@@ -305,8 +275,6 @@ class _Table:
             by = self.factor(q, a), self.factor(w, b)
             stated = [self.stated.unit(path) for path in (a, b)]
             fits = any(True for _ in _readings(one.slope * by[1] / by[0], stated, by))
-            if bare and not fits and abs(one.correlation) < SURELY:
-                continue  # neither name nor size: a voltage follows the speed that it drives
             if not first and len(bare) == 2 and one.tenfold is None:
                 continue
             points = _capped(one) - 1.5 * (not fits) - 0.5 * (one.correlation < 0)
@@ -368,54 +336,43 @@ class _Table:
                 self.add(name, path, POINTS_TO_PROPOSE + _capped(like), why)
                 self.doubted.add((name, path))
 
-    def solved(self, *, by_order: bool) -> dict[str, Guess]:
-        """Return the assignment of most points by name, and where it leaves roles what is left.
+    def solved(self, *, named: bool) -> dict[str, Guess]:
+        """Return the assignment of most points by name; other roles have what may fit.
 
         Args:
-            by_order: whether inputs may take what is left in the log's order.
+            named: whether roles are named after numbers, so that none is left for another.
         """
         taken = self.taken()
         sent = {path for name, path in taken.items() if self.roles[self.row[name]].sent}
-        made = self._left_over(taken, by_order)
-        for role in self.roles:
-            if path := taken.get(role.name, ""):
-                name = role.name
-                away = {*taken.values()} - sent if role.sent else sent
-                near = tuple(p for p in self._near(name) if p != path and p not in away)
-                sure = not near and (name, path) in self.named - self.doubted
-                why = tuple(self.why.get((name, path), ()))
-                made[name] = Guess(name, path, "", sure, near, None, why)
-        return {role.name: made[role.name] for role in self.roles}
-
-    def _left_over(self, taken: Mapping[str, str], by_order: bool) -> dict[str, Guess]:
-        """Return roles without enough points: with a number if as many fit, else with what fits."""
         left = [n for n in self.numbers if n.moves and n.path not in {*taken.values()}]
         lost = [role for role in self.roles if role.name not in taken]
         tops = {role.name: self._best_fitting(role.name, left) for role in lost}
-        inputs = [role.name for role in lost if role.sent]
-        if by_order := by_order and not any(tops.values()) and self._any_order(taken, lost, left):
-            tops |= {name: [number.path for number in left] for name in inputs}
-
-        # As many roles as numbers of which each fits each: the log's order is theirs.
-        made, given = {}, set[str]()
-        for role in lost:
-            name, top = role.name, tops[role.name]
-            alike = [other for other, some in tops.items() if some == top]
-            sole = all(some == top or not {*some} & {*top} for some in tops.values())
-            said = by_order or len(top) == 1 or all(self.stated.unit(path) for path in top)
-            if top and sole and len(top) == len(alike) and said:
-                path = top[alike.index(name)]
-                number = self.numbers[self.at[path]]
-                clear = number.command and self.points[self.row[name], self.at[path]] >= SURE_LEAD
-                sure = (clear or len(lost) == len(left) == 1) and not by_order
-                why = found("start.left", name, numbers=tuple(top), only=not by_order or None)
-                rest = tuple(p for p in top if p != path)
-                known = tuple(self.why.get((name, path), ()))
-                made[name] = Guess(name, path, "", not rest and sure, rest, None, (*known, why))
-                given.add(path)
-        for role in (one for one in lost if one.name not in made):
-            made[role.name] = self._offered(role, [n for n in left if n.path not in given])
+        last = not named and len(lost) == len(left) == 1 and not any(tops.values())
+        tops |= {lost[0].name: [left[0].path]} if last else {}
+        made = dict[str, Guess]()
+        for role in self.roles:
+            name, path = role.name, taken.get(role.name, "")
+            top = tops.get(name, [])
+            others = {path for other, some in tops.items() if other != name for path in some}
+            if path:
+                away = {*taken.values()} - sent if role.sent else sent
+                near = tuple(p for p in self._near(name) if p != path and p not in away)
+                sure = not near and (name, path) in self.named - self.doubted
+                made[name] = Guess(name, path, "", sure, near, None, self._why(name, path))
+            elif len(top) == 1 and top[0] not in others:  # the only one left that fits
+                number = self.numbers[self.at[top[0]]]
+                clear = number.command and self.points[self.row[name], self.at[top[0]]] >= SURE_LEAD
+                sure = clear or (len(lost) == len(left) == 1 and not last)
+                why = found("start.left", name, numbers=tuple(top), only=not last or None)
+                made[name] = Guess(
+                    name, top[0], "", sure, (), None, (*self._why(name, top[0]), why)
+                )
+            else:
+                made[name] = self._offered(role, left)
         return made
+
+    def _why(self, name: str, path: str) -> tuple[Finding, ...]:
+        return tuple(self.why.get((name, path), ()))
 
     def _best_fitting(self, role: str, left: Sequence[_Number]) -> list[str]:
         """Return the numbers that fit a role about as well as the best one."""
@@ -423,31 +380,12 @@ class _Table:
         fits = {n.path: row[self.at[n.path]] for n in left if row[self.at[n.path]] >= 1.0}
         return [path for path in fits if fits[path] > max(fits.values()) - LEAD]
 
-    def _any_order(
-        self, taken: Mapping[str, str], lost: Sequence[_Role], left: Sequence[_Number]
-    ) -> bool:
-        """Check whether the numbers that are left can only be the inputs that are lost.
-
-        So it is if as many are left, and every state is known, or the rate of one that is.
-        """
-        inputs = [role for role in lost if role.sent]
-        known = {*taken, *(w for q, w in self.rates.items() if q in taken)}
-        states = [role.name for role in self.roles if not role.sent]
-        named = any((name, taken.get(name)) in self.named for name in states)
-        fits = all(
-            not n.said or factor_between(n.said, role.unit) is not None
-            for role, n in zip(inputs, left, strict=False)
-        )
-        several = len(inputs) > 1 and named
-        return len(inputs) == len(left) > 0 and known >= {*states} and fits and not several
-
     def _offered(self, role: _Role, left: Sequence[_Number]) -> Guess:
         """Return a role without a number: the commands, what has points, or what is possible."""
         row, possible = self.points[self.row[role.name]], {*self._possible(role.name, left)}
         may = [n for n in left if not (role.sent and n.measured)]
         some = [n for n in may if role.sent and n.command]
         some = some or [n for n in may if row[self.at[n.path]] > 0]
-        some = some or [n for n in self.numbers if (role.name, n.path) in self.named]
         some = some or [n for n in may if n.path in possible and not n.said]
         some.sort(key=lambda n: -float(row[self.at[n.path]]))
         empty = [t.topic for t in self.log.topics if not t.messages]
@@ -458,7 +396,7 @@ class _Table:
 
     def finished(self, guess: Guess) -> Guess:
         """Return a guess with its clock, its range, and the unit that the log states."""
-        path, wanted = guess.path or next(iter(guess.others), ""), self.units[guess.name]
+        path = guess.path or next(iter(guess.others), "")
         if path not in self.at:
             return replace(guess, clock="log")
         number = self.numbers[self.at[path]]
@@ -469,9 +407,6 @@ class _Table:
         if len(guess.others) > 3:
             guess = replace(guess, others=guess.others[:3])
         factor = self.factor(guess.name, path)
-        if number.said and guess.scale == 1 and factor_between(f"{number.said}/s", wanted):
-            why = found("start.unit", guess.name, unit=number.said, model=wanted)
-            return guess.because(why, sure=False)  # deg, of a rate
         return replace(guess, scale=guess.scale * factor) if abs(factor - 1) > 1e-9 else guess
 
 

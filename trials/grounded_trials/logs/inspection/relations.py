@@ -1,30 +1,18 @@
 """What the samples of a log say of which number is what: rates, and what a model's inputs do.
 
 `Signals` reads the samples once and puts them on a common grid; `follows` compares two of them.
-
-`by_inputs` decides which number is which input by the steps of the model. A model skeleton has
-neither correct masses nor gravity, so the size of its error is meaningless: the smaller of two
-torques fits anywhere. What is compared is the part of each state's motion that remains after
-removing everything that the states may explain (drag, springs, gravity) and after giving every
-input its best gain, with the model's sign. An assignment is taken if it is clearly better than
-every other one.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice, permutations, product
+from itertools import permutations
 
 import numpy as np
 
 from grounded.errors import GroundedError
-from grounded.findings import found
-from grounded.frozen import Array
-from grounded.model import Model
-from grounded.places import probe
 from grounded_trials.formats.messages import Floats
-from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy, unwound
 from grounded_trials.logs.signals import Series, SignalSpec, read_signals
@@ -181,108 +169,3 @@ def _one_by_one(log: LogReport, specs: Mapping[str, SignalSpec]) -> dict[str, Se
         except GroundedError:
             continue
     return found
-
-
-WINDOW = 0.05  # [s] length of a step: in shorter ones noise dominates
-PIECES, PIECE_STEPS = 8, 20  # pieces of the log, evaluated separately; steps of the shortest
-BETTER = 0.2  # [nats] lead in the squared error of all states: 10 % of the error
-PIECES_AGREE = 0.75  # share of the pieces that must agree
-
-Paths = tuple[str, ...]
-
-
-def by_inputs(model: Model, guesses: Mapping[str, Guess], signals: Signals) -> dict[str, Guess]:
-    """Return the unsure inputs as the model's steps decide them, {} if they are not conclusive.
-
-    Args:
-        model: however crude.
-        guesses: of all its states and inputs.
-        signals: the samples of all candidates.
-    """
-    unsure = [n for n in model.input_names if guesses[n].others]
-    known = [*model.state_names, *model.input_names]
-    if not unsure or not all(guesses[name].path for name in known if name not in unsure):
-        return {}
-    units = {**model.states, **model.inputs}
-    fixed = {guesses[name].path for name in known if name not in unsure}
-    choices = [
-        [p for p in (guesses[n].path, *guesses[n].others) if p in signals.found and p not in fixed]
-        for n in unsure
-    ]
-    apart = (chosen for chosen in product(*choices) if len({*chosen}) == len(chosen))
-    tried = list(islice(apart, COMBINATIONS + 1))
-    left: dict[Paths, Array] = {}
-    for chosen in tried[:COMBINATIONS]:
-        paths = {n: guesses[n].path for n in known} | dict(zip(unsure, chosen, strict=True))
-        gridded = signals.grid(list(paths.values()))
-        if gridded is not None:
-            own = signals.log.stated
-            scales = [guesses[name].scale * own.factor(paths[name], units[name]) for name in known]
-            left[chosen] = _left(model, gridded[0], np.column_stack(gridded[1]) * scales)
-
-    # The best must lead in most pieces of the log.
-    if len(left) < 2 or len(tried) > COMBINATIONS:
-        return {}
-    best = min(left, key=lambda one: float(left[one].sum()))
-    gains = [left[one] - left[best] for one in left if one != best]
-    if not all(g.mean() > BETTER and (g > 0).mean() >= PIECES_AGREE for g in gains):
-        return {}
-    gain = min(float(g.mean()) for g in gains)
-    why = found("start.steps", share=float(1 - np.exp(-gain / 2)), nats=gain / 2)
-    taken = {n: _moved_to(guesses[n], path) for n, path in zip(unsure, best, strict=True)}
-    return {n: one.because(why, sure=True) for n, one in taken.items()}
-
-
-def _moved_to(guess: Guess, path: str) -> Guess:
-    """Return the guess moved to another of its candidates."""
-    if path == guess.path:
-        return guess
-    rest = tuple(p for p in (guess.path, *guess.others) if p not in ("", path))
-    return replace(guess, path=path, others=rest, field=None, reasons=())
-
-
-def _left(model: Model, step: float, values: Floats) -> Array:
-    """Return the log squared error per piece (P,), summed over the states."""
-    k, n = max(1, round(WINDOW / step)), model.n
-    x, sums = values[:, :n], np.cumsum(np.vstack([np.zeros(model.m), values[:, n:]]), axis=0)
-    u, dt = ((sums[k:] - sums[:-k]) / k)[: len(x) - k], probe(model, k * step)
-    with np.errstate(all="ignore"):
-        none = model.system.step(x[:-k], 0 * u, model.values, dt)
-        moved = model.difference(x[k:], none)
-        each = [
-            model.difference(model.system.step(x[:-k], u * one, model.values, dt), none)
-            for one in np.eye(model.m)
-        ]
-    good = np.isfinite(np.column_stack([moved, *each])).all(axis=1)
-    moved, does = moved[good], np.stack(each)[:, good]
-    own = _explained(model, x[:-k][good])
-    pieces = np.array_split(np.arange(len(moved)), max(1, min(PIECES, len(moved) // PIECE_STEPS)))
-    left = np.zeros(len(pieces))
-    for i in range(n):
-        both = np.column_stack([moved[:, i], *does[:, :, i]])
-        both = both - own @ np.linalg.lstsq(own, both, rcond=None)[0]
-        y, effects = both[:, 0], both[:, 1:]
-        after = y - effects @ _gains(effects, y)
-        left += [np.log(float(after[at] @ after[at]) + 1e-24) for at in pieces]
-    return left
-
-
-def _explained(model: Model, x: Array) -> Array:
-    """Return regressors (N, k) for motion without inputs: the states, and sines of angles."""
-    turns = [i for i, unit in enumerate(model.states.values()) if unit == "rad"]
-    columns = [np.ones(len(x)), x, np.sin(x[:, turns]), np.cos(x[:, turns])]
-    own = np.column_stack(columns)
-    size: Array = own / np.maximum(np.abs(own).max(axis=0, initial=0.0), 1e-12)
-    return size
-
-
-def _gains(effects: Array, y: Array) -> Array:
-    """Return the best gains, none below 0, since exchanged wheels would need negative ones."""
-    from scipy.optimize import nnls
-
-    size = np.sqrt((effects**2).sum(axis=0))
-    used = size > 1e-9 * max(float(np.sqrt(y @ y)), 1e-12)
-    gains = np.zeros(len(size))
-    if used.any():
-        gains[used] = nnls(effects[:, used] / size[used], y)[0] / size[used]
-    return gains
