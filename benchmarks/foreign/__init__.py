@@ -1,7 +1,7 @@
 """The search on foreign systems: MuJoCo, JSBSim and CommonRoad in the robot's place.
 
 robots       runs a policy in a simulator and returns a Trial
-mechanisms   cart-pole, two-link arm, seven-joint arm (MuJoCo)
+mechanisms   cart-pole, two-link arm, files that others ship (MuJoCo)
 pushing      a block pushed over a floor (MuJoCo)
 aircraft     a Cessna 172 (JSBSim)
 cars         a single-track drift car and a multi-body car (CommonRoad)

@@ -2,7 +2,7 @@
 
 The crude models of the cart-pole and the two-link arm are their equations of motion in plain NumPy
 (`grounded.models`), with the simulator's masses and lengths, so that only what a set-up withholds
-differs. The seven-joint arm is planned in MuJoCo itself.
+differs.
 """
 
 from __future__ import annotations
@@ -72,7 +72,6 @@ CART_TASKS = {  # steps, limit [N], weights
         },
     ),
     "smooth": (200, 30.0, {"state": {"theta": 0.1}, "terminal": END, "input": 0.01, "change": 0.1}),
-    "hasty": (200, 30.0, {"state": {"x": 1.0, "theta": 1.0}, "terminal": END, "input": 0.002}),
 }  # fmt: skip
 
 
@@ -80,7 +79,7 @@ def cart_task(kind: str) -> Task:
     """Return the task from hanging to upright at the origin, with every target column given.
 
     "gentle" is solved from the first guess; "smooth" has a first guess from which 100 iterations
-    are not enough, though zero inputs are a good start; "hasty" has many local optima.
+    are not enough, though zero inputs are a good start.
     """
     H, limit, weights = CART_TASKS[kind]
     start = np.array([0.0, np.pi, 0.0, 0.0])
@@ -115,57 +114,6 @@ def holding(model: Model, q: np.ndarray, dt: float = 0.005) -> np.ndarray:
     at = lambda u: model.system.step(x, u[None], model.values, dt)[0, m:]  # noqa: E731
     free = at(np.zeros(m))
     return np.linalg.solve(np.column_stack([at(e) - free for e in np.eye(m)]), -free)
-
-
-# Seven joints: MuJoCo itself is the crude model, through the adapter.
-
-LINKS = (  # axis, offset [m], mass [kg]
-    ("0 0 1", 0.16, 4.0), ("0 1 0", 0.18, 4.0), ("0 0 1", 0.18, 3.0), ("0 -1 0", 0.22, 2.7),
-    ("0 0 1", 0.18, 1.7), ("0 1 0", 0.22, 1.8), ("0 0 1", 0.08, 0.4),
-)  # fmt: skip
-TORQUES = np.array([176.0, 176.0, 110.0, 110.0, 110.0, 40.0, 40.0])
-
-
-def arm7_xml(payload: float = 0.1, friction: float = 0.0, timestep: float = 0.005) -> str:
-    """Return a chain of seven links with alternating axes, masses and lengths about an iiwa's."""
-    body = end = ""
-    for i, (axis, offset, mass) in enumerate(LINKS, start=1):
-        body += (
-            f'<body name="link{i}" pos="0 0 {offset}">'
-            f'<joint name="q{i}" axis="{axis}" damping="0.5" armature="0.05" '
-            f'frictionloss="{friction}"/>'
-            f'<inertial pos="0 0.01 0.09" mass="{mass}" '
-            f'diaginertia="{0.006 * mass} {0.006 * mass} {0.003 * mass}"/>'
-        )
-        end += "</body>"
-    hand = f'<inertial pos="0 0 0" mass="{payload}" diaginertia="1e-4 1e-4 1e-4"/>'
-    motors = "".join(f'<motor name="tau{i}" joint="q{i}"/>' for i in range(1, 8))
-    return (
-        f'<mujoco model="arm7"><option timestep="{timestep}" integrator="implicitfast"/>'
-        f'<worldbody>{body}<body name="hand" pos="0 0 0.1">{hand}</body>{end}</worldbody>'
-        f"<actuator>{motors}</actuator></mujoco>"
-    )
-
-
-def arm7_task() -> Task:
-    from grounded.adapters import mujoco
-
-    model = mujoco.model(arm7_xml(), params=("hand.mass", "q2.damping", "q4.damping"))
-    start = np.array([0.0, 0.4, 0.0, -1.2, 0.0, 0.8, 0.0])
-    end = np.array([0.8, 0.9, 0.4, -0.6, -0.5, 1.2, 0.6])
-    t = 0.02 * np.arange(61)
-    path = minimum_jerk(start, end, t / 0.9)
-    return task_of(
-        model,
-        0.02,
-        np.hstack([path, np.full((61, 7), np.nan)]),
-        np.append(start, np.zeros(7)),
-        TORQUES,
-        state=dict.fromkeys(model.state_names[:7], 20.0),
-        input=(2e-2 / TORQUES**2).tolist(),
-        change=(2e-1 / TORQUES**2).tolist(),
-        past=holding(model, start),
-    )
 
 
 # Systems that others ship as MJCF: the file is the crude model, and what is withheld is changed in

@@ -47,11 +47,6 @@ def arm(name: str, withheld: str, delay: float = 0.0, **xml: object) -> Setup:
     return Setup(name, withheld, task, *mech.mujoco_setup(task, arm_xml(**xml), delay))
 
 
-def arm7(name: str, withheld: str, **xml: float) -> Setup:
-    task = mech.arm7_task()
-    return Setup(name, withheld, task, *mech.mujoco_setup(task, mech.arm7_xml(**xml)))
-
-
 def shipped(
     name: str, withheld: str, system: str, cause: str, delay: float = 0.0, noise: float = 0.0,
     **what: float,
@@ -95,7 +90,6 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     "swing-up": (cart, "nothing", {"kind": "smooth"}),
     "swing-up-friction": (cart, "cart friction 0.8 N", FRICTION | {"kind": "smooth"}),
     "swing-up-lag": (cart, "activation filter 50 ms", LAG | {"kind": "smooth"}),
-    "swing-up-hasty": (cart, "nothing", {"kind": "hasty"}),
     "arm": (arm, "nothing", {"integrator": "RK4"}),
     "arm-payload": (arm, "payload 0.5 kg", {"part": LOAD}),
     "arm-friction": (arm, "joint friction 0.6 N m", {"part": DRY}),
@@ -107,9 +101,6 @@ SETUPS: dict[str, tuple[Callable[..., Setup], str, dict[str, object]]] = {
     ),
     "arm-armature-lag": (arm, "armature 0.15 kg m2, filter 20 ms", {"part": HEAVY}),
     "arm-gear": (arm, "gear 0.8 of joint 1", {"gear": 0.8}),
-    "arm7": (arm7, "nothing", {}),
-    "arm7-payload": (arm7, "payload 1.4 kg", {"payload": 1.5}),
-    "arm7-friction": (arm7, "joint friction 1 N m", {"friction": 1.0}),
     "block": (block, "inertia, contact, pressure, friction", {}),
     "cessna": (cessna, "sideslip, speed, engine", {}),
     "cessna-wind": (cessna, "the same and a cross-wind of 3 m/s", {"wind": 3.0}),

@@ -61,10 +61,7 @@ def test_the_joints_of_an_arm_by_name(tmp_path):
     [
         (("elbow_joint", "shoulder_joint"), (1, 0)),
         (("elbow", "shoulder_lift", "shoulder_pan", "wrist_2", "wrist_1"), (2, 1, 0, 4, 3)),
-        (("ankle", "hip_pitch", "hip_yaw", "knee"), (2, 1, 3, 0)),
         (("joint1", "joint10", "joint2"), (0, 2, 1)),
-        (("left_elbow", "left_shoulder", "right_elbow"), (0, 1, 2)),  # of two limbs
-        (("tilt", "elbow"), (0, 1)),
     ],
 )
 def test_joints_are_counted_from_the_base(joints, ordered):

@@ -229,18 +229,6 @@ def test_stamps_in_milliseconds_are_refused_with_what_to_do() -> None:
         grid(slow(pose(np.sin)), slow(command()))
 
 
-def test_a_sample_far_outside_everything_else_is_told() -> None:
-    def spiked(t: np.ndarray) -> np.ndarray:
-        y = np.sin(t)
-        y[len(y) // 2] = 1e4
-        return np.asarray(y)
-
-    (told,) = of_code(grid(pose(spiked)), "file.outlier")
-    assert told.about == ("x",)
-    stepped = grid(pose(lambda t: np.where(t > 1.0, 500.0, np.sin(t))))
-    assert not of_code(stepped, "file.outlier")
-
-
 def test_a_state_that_vanishes_half_way_is_told() -> None:
     whole, part = pose(np.sin), pose(np.cos)
     n = len(part.t) // 2

@@ -133,15 +133,6 @@ FILE: dict[str, Entry] = {
         "see [log.span][[every? and the unit of the times]]",
     ),
     # what is odd in a log
-    "staircase": warn(
-        "{about} {about:changes/change} at {changes:g} Hz, but rows come at {rows:g} Hz: samples "
-        "are held and {late:g} s late on average",
-        "leave cells empty in rows that repeat a value",
-    ),
-    "outlier": warn(
-        "'{about}' is {value:.4g} at {at:.3f} s, far outside all its other samples, {low:.4g} to "
-        "{high:.4g}",
-    ),
     "vanished": warn(
         "[[{about} {about:has/have} no sample after {until:.2f} s of the log: the trial ends "
         "there]][[{about} is not a finite number at {ends}: the trial ends there]][[all states "

@@ -43,9 +43,7 @@ from grounded_trials.logs.signal_report import (
     SignalReport,
     check_clocks,
     findings_of,
-    outliers,
     report_of,
-    staircases,
     vanished,
 )
 from grounded_trials.logs.signals import Clock, Series, SignalSpec
@@ -192,11 +190,9 @@ def to_grid(
     def told() -> tuple[tuple[SignalReport, ...], tuple[Finding, ...]]:
         own = ((samples[n], series[n], values[n], at[n]) for n in names)
         reports = tuple(report_of(*one, start) for one in own)
-        stairs = staircases(tracked, start, int(grid[-1]), dt)
-        odd = outliers(tracked, start, int(grid[-1]))
         cut = stop == until and (steps is None or count < steps) and span.end is None
         gone = vanished(measured, int(grid[-1] + dt * 1e9)) if cut else []
-        return reports, (*findings_of(reports, late), *clocks, *stairs, *odd, *gone)
+        return reports, (*findings_of(reports, late), *clocks, *gone)
 
     held, assumed = begun.held_before(start, dt, rest)
     return Gridded(

@@ -74,11 +74,6 @@ class Samples:
         after = np.clip(np.searchsorted(self.t, at, "right"), 1, len(self.t) - 1)
         return after - 1, after
 
-    def within(self, first: int, last: int) -> tuple[Ints, Floats]:
-        """Return the stamps [ns] and the values from `first` to `last` [ns]."""
-        inside = (self.t >= first) & (self.t <= last)
-        return self.t[inside], self.y[inside]
-
     def max_gap(self, dt: float) -> float:
         """Return the largest distance of two samples between which values are known [s]."""
         if self.spec.max_age_s is not None:

@@ -1,8 +1,8 @@
 """Statistics of a log's signals, and findings that follow from them.
 
 `SignalReport` states rate, jitter, gaps and dropped samples of one signal. `check_clocks` refuses
-signals on different clocks, `staircase` warns of sensors that are late because rows repeat their
-values, `findings_of` says what is odd in reports.
+signals on different clocks, `findings_of` says what is odd in reports. Values that are held or far
+outside are found in trials: `grounded.accounts.signals`.
 """
 
 from __future__ import annotations
@@ -22,9 +22,6 @@ from grounded_trials.logs.signals import Series
 
 SKEW_S = 0.1  # signals whose clocks differ by more than this cause a warning
 BRIDGED = 1.9  # a value between samples more than this many intervals apart counts as bridged
-LEAST_RUNS, REPEATED = 20, 0.8  # a held signal: fewest runs, and share with two or more samples
-COARSE = 2.5  # least ratio of median to smallest change of a signal that is not quantised
-FAR_OUTSIDE = 10.0  # times the range of all other samples of a signal: a sample is far outside them
 LOST = 0.1  # least share of a log that is told if one state lacks it
 
 
@@ -99,64 +96,6 @@ def check_clocks(series: Mapping[str, Series]) -> list[Finding]:
         raise GroundedError(found("file.clocks", first, last, apart=apart))
     told = apart > SKEW_S and len({one.spec.clock for one in series.values()}) > 1
     return [found("file.clocks", first, last, apart=apart, weight=Weight.WARN)] * told
-
-
-def staircases(series: Sequence[Samples], first: int, last: int, dt: float) -> list[Finding]:
-    """Find signals that are late because rows repeat each of their values.
-
-    A table has a row per sample of its fastest signal, so rows repeat the samples of a slower
-    sensor. A quantised signal also repeats values, but changes by few different steps.
-
-    Args:
-        series: of states.
-        first: the trial's start [ns].
-        last: the trial's end [ns].
-        dt: control step [s]; values held for up to half of it don't matter.
-
-    Returns:
-        One finding for all signals that change at the same rate.
-    """
-    slow: dict[tuple[float, float, float], list[str]] = {}
-    for samples in series:
-        t, y = samples.within(first, last)
-        new = np.flatnonzero(np.append(True, np.diff(y) != 0)) if len(y) else np.empty(0, int)
-        lengths, sizes = np.diff(new), np.abs(np.diff(y[new]))
-        if len(lengths) < LEAST_RUNS or np.mean(lengths >= 2) < REPEATED:
-            continue
-        apart = float(t[new[-1]] - t[new[0]]) * 1e-9 / len(lengths)
-        if apart <= dt / 2 or float(np.median(sizes)) < COARSE * float(sizes.min()):
-            continue
-        late = (apart - samples.interval) / 2
-        rate, rows, by = (float(f"{x:.3g}") for x in (1 / apart, 1 / samples.interval, late))
-        slow.setdefault((rate, rows, by), []).append(samples.name)
-    return [
-        found("file.staircase", *names, changes=rate, rows=rows, late=late)
-        for (rate, rows, late), names in slow.items()
-    ]
-
-
-def outliers(series: Sequence[Samples], first: int, last: int) -> list[Finding]:
-    """Find single samples far outside everything else that their signal has.
-
-    Args:
-        series: of states.
-        first: the trial's start [ns].
-        last: the trial's end [ns].
-    """
-    far = []
-    for samples in series:
-        t, y = samples.within(first, last)
-        if len(y) < LEAST_RUNS:
-            continue
-        jump = np.abs(np.diff(y))  # in and out again, or a step would count
-        alone = np.minimum(jump[:-1], jump[1:])
-        i = int(np.argmax(alone)) + 1
-        others = np.delete(y, i)
-        if alone[i - 1] > FAR_OUTSIDE * np.ptp(others) > 0:
-            facts: dict[str, Any] = {"value": float(y[i]), "at": float(t[i] - first) * 1e-9}
-            ends: dict[str, Any] = {"low": float(others.min()), "high": float(others.max())}
-            far.append(found("file.outlier", samples.name, **facts, **ends))
-    return far
 
 
 def vanished(series: Sequence[Samples], last: int) -> list[Finding]:

@@ -20,19 +20,11 @@ from grounded_trials.logs.stated_units import SLIDING, TURNING
 AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
 PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
-LEG = ("hip", "thigh", "knee", "shin", "ankle", "foot", "toe")
 WITHIN = ("yaw", "pan", "lift", "pitch", "flex", "roll")  # order of joints within one part
-SIDES = ("left", "right", "front", "rear")  # words that indicate several limbs
 SLIDES = {  # words of prismatic joints, in metres
-    *("trolley", "cart", "carriage", "slide", "slider", "rail", "prismatic", "linear"),
-    *("gantry", "lift", "elevator", "telescope"),
+    *("trolley", "cart", "carriage", "slide", "slider", "rail", "prismatic", "linear", "gantry"),
 }
-TURNS = {  # words of revolute joints, which take precedence: a shoulder's lift, a pole on a cart
-    *LIMB,
-    *LEG,
-    *("yaw", "pan", "pitch", "flex", "roll", "tilt", "wheel", "hinge", "revolute", "rotation"),
-    *("pole", "pendulum", "swing", "sway", "angle", "theta"),
-} - {"base", "torso"}
+TURNS = {*LIMB, *WITHIN, "tilt", "wheel", "hinge", "pole", "pendulum", "swing", "angle", "theta"}
 # Points of a joint's number; less of each further one.
 NAMED, ORDERED, UNKNOWN, LESS = 6.0, 2.5, 1.5, 0.2
 
@@ -69,9 +61,17 @@ def _aimed_at(topic: str, kind: str, index: int, there: set[str]) -> str:
 
 
 def slides(joint: str) -> bool:
-    """Check whether a joint's name is that of a prismatic joint: a trolley, a rail, a lift."""
-    words = _words(joint)
-    return bool(words & SLIDES) and not words & TURNS
+    """Check whether a joint's name is that of a prismatic joint: a trolley, a rail."""
+    return not SLIDES.isdisjoint(_words(joint))
+
+
+def turns(joint: str) -> bool:
+    """Check whether a joint's name is that of a revolute joint."""
+    return not TURNS.isdisjoint(_words(joint))
+
+
+def _words(joint: str) -> list[str]:
+    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)]
 
 
 def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
@@ -83,31 +83,21 @@ def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
         joints: see `joint_names`.
     """
     return {
-        number_of(topic, kind, i): unit * (slides(joint) or bool(_words(joint) & TURNS))
+        number_of(topic, kind, i): unit * (slides(joint) or turns(joint))
         for topic, names in joints.items()
         for i, joint in enumerate(names)
         for kind, unit in (SLIDING if slides(joint) else TURNING).items()
     }
 
 
-def _words(joint: str) -> set[str]:
-    return {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)}
-
-
 def from_base(joints: Sequence[str]) -> tuple[str, ...]:
-    """Sort the joints of one limb from its base, by body parts or numbers; else keep the order."""
-    if any(_first(SIDES, joint) < len(SIDES) for joint in joints):
-        return tuple(joints)
-    numbers = {joint: [int(n) for n in re.findall(r"\d+", joint)] for joint in joints}
-    for parts in (LIMB, LEG):
-        part = {joint: _first(parts, joint) for joint in joints}
-        if len(parts) not in part.values():
-            within = {
-                joint: (part[joint], _first(WITHIN, joint), numbers[joint]) for joint in joints
-            }
-            return tuple(sorted(joints, key=within.__getitem__))
-    counted = len({re.sub(r"\d+", "", joint) for joint in joints}) == 1
-    return tuple(sorted(joints, key=numbers.__getitem__)) if counted else tuple(joints)
+    """Sort the joints of an arm from its base, by body parts and numbers."""
+
+    def place(joint: str) -> tuple[int, int, list[int]]:
+        numbers = [int(n) for n in re.findall(r"\d+", joint)]
+        return _first(LIMB, joint), _first(WITHIN, joint), numbers
+
+    return tuple(sorted(joints, key=place))
 
 
 def _first(words: Sequence[str], joint: str) -> int:
@@ -170,7 +160,7 @@ def in_order(
             those = [name for name, (own, _) in roles.items() if own == unit]
             for name, joint in zip(those, some, strict=True) if len(those) == len(some) else ():
                 why = found("start.joint", topic, joint=joint, index=str(_place(joint, names)))
-                points = ORDERED if slide or _words(joint) & TURNS else UNKNOWN
+                points = ORDERED if slide or turns(joint) else UNKNOWN
                 measured = Joint(points, why, doubted=len(some) > 1)
                 given[name] = _numbers(topic, names, joint, kind, measured, log, roles[name][1])
     return given
@@ -200,7 +190,7 @@ def _numbers(
     torque = sent and kind == "effort"
     if sent and _part(topic) in AIMED:
         path = _aimed_at(topic, kind, names.index(joint), there)
-    elif arrays := commands(log, len(names), plain) if torque or (sent and plain) else []:
+    elif arrays := commands(log, len(names)) if torque or (sent and plain) else []:
         at = _place(joint, names)
         paths = [f"{array}[{at}]" for array in arrays] + [path] * (torque and path in there)
         paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
@@ -212,24 +202,18 @@ def _numbers(
 
 
 def _there(log: LogReport) -> set[str]:
-    """Return the paths of a log, except for constant efforts: many robots leave them at zero."""
-    return {
-        field.path
-        for topic in log.topics
-        for field in topic.fields
-        if field.low != field.high or ".effort[" not in field.path
-    }
+    """Return the paths of a log's numbers."""
+    return {one.path for one in log.numbers}
 
 
-def commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
-    """Return array topics with a torque command for each of `count` joints; `plain`: any kind."""
+def commands(log: LogReport, count: int) -> list[str]:
+    """Return array topics with a command for each of `count` joints."""
     words = ("cmd", "command", "effort", "torque", "desired", "ref")
     return [
         f"{topic.topic}.data"
         for topic in log.topics
         if "MultiArray" in topic.type
         and any(word in topic.topic.lower() for word in words)
-        and (plain or not any(word in topic.topic.lower() for word in ("position", "velocity")))
         and sum(".data[" in field.path for field in topic.fields) == count
     ]
 
@@ -237,10 +221,4 @@ def commands(log: LogReport, count: int, plain: bool = False) -> list[str]:
 def holds(name: str, joint: str) -> bool:
     """Check whether a state's name is a joint's, perhaps with a word for the quantity."""
     plain = re.sub(r"(_?joint_?)", "", joint.lower()) or joint.lower()
-    parts = name.lower().split("_")
-    return (
-        name.lower() in (joint.lower(), plain)
-        or any(part in (joint.lower(), plain) for part in parts)
-        or plain == "_".join(parts[1:])
-        or plain == "_".join(parts[:-1])
-    )
+    return not {joint.lower(), plain}.isdisjoint((name.lower(), *name.lower().split("_")))

@@ -59,7 +59,6 @@ NAMES_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by it
 }
 _BESIDE_U = ("linear.y", "v", "sway")  # meaning of v beside a state u: sway, not the speed
 _COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; either may be x
-_RATES = {"rate", "rates", "dot", "vel", "velocity"}  # words of a rate, not of an angle
 _COMMANDED = (
     *("ref", "reference", "desired", "des", "target", "setpoint", "goal", "cmd", "command"),
     *("action", "output"),
@@ -73,9 +72,7 @@ PARTS = re.compile(
 POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 _WORD = re.compile(r"[a-z]+")
 TABLES = ("npz", "csv", "parquet", "mat", "run")  # topics of tables: a column's name says it all
-_FLAT = re.compile(r"_(linear|angular)_(?=[xyz]$)")  # a Twist in a table: cmd_vel_linear_x
-_HUMP = re.compile(r"(?<=[a-z])(?=[A-Z][a-z])")  # between the words of armAngle
-WORTH, LESS, TOPIC = 4.0, 0.3, 3.0  # points of the usual name, less of each further one
+WORTH, LESS = 4.0, 0.3  # points of the usual name, less of each further one
 
 
 def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) -> tuple[str, ...]:
@@ -108,15 +105,9 @@ def name_points(
         field: the number.
         is_input: whether a command is sought.
     """
-    rest = field.path[len(topic.topic) :]
-    inside, apart = (one.lower().strip('".') for one in (rest, _HUMP.sub("_", rest)))
     plain = bare_command if is_input else without_unit
-    bare = plain(field.path)[len(topic.topic) :].lower().strip('".')
-    ways = {inside, bare, apart, _FLAT.sub(r".\1.", inside)}
+    ways = {one[len(topic.topic) :].lower().strip('".') for one in (field.path, plain(field.path))}
     best = max(_fit(called, one, topic.topic.lower()) for one in ways)
-    folders = topic.topic.lower().split("/")[:-1]  # /thrusters/left/command is the input `left`
-    if is_input and inside in ("data", "value") and {*called} & {*folders}:
-        best = max(best, TOPIC)
     if best <= 0 and is_input and COMMAND_TOPIC.search(topic.topic.lower()):
         state = without_role(name)  # the command of a state, such as roll_command
         usual = (state, *_MEANINGS.get(state, ())) if state != name else ()
@@ -125,15 +116,13 @@ def name_points(
         return 0.0
     words = {*_WORD.findall(field.path.lower())}
     commanded = any(word in words for word in _COMMANDED)
-    return best + (0.5 if is_input else -2.0) * commanded + 0.5 * (topic.stamped and not is_input)
+    return best if is_input else best - 2.0 * commanded + 0.5 * topic.stamped
 
 
 def _fit(called: Sequence[str], inside: str, topic: str) -> float:
     """Score how well a name fits: by the end of the path, or by the topic if that is generic."""
     best = 0.0
     for rank, meaning in enumerate(called):
-        if WORLD in inside and WORLD not in meaning:
-            continue  # its last letter is an axis, not a name
         worth = WORTH - LESS * max(rank - 1, 0)
         if inside == meaning or inside.endswith("." + meaning):
             best = max(best, worth + (0.5 if "." in meaning else 0.0))
@@ -141,9 +130,9 @@ def _fit(called: Sequence[str], inside: str, topic: str) -> float:
         if inside in ("data", "value") and last == meaning:
             best = max(best, worth)
         elif len(meaning) > 1:
-            words = set(_WORD.findall(_named(inside, last)))
-            rate = words & _RATES - set(_WORD.findall(meaning))  # `yaw_rate` is not a yaw
-            best = max(best, worth - 1.0) if meaning in words and not rate else best
+            best = (
+                max(best, worth - 1.0) if meaning in _WORD.findall(_named(inside, last)) else best
+            )
     return best
 
 
