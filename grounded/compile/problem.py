@@ -127,7 +127,7 @@ class Problem:
     @property
     def horizon(self) -> int:
         """H, the number of control steps."""
-        return int(self.bias.shape[0])
+        return int(self.bias.shape[-2])
 
     @cached_property
     def depths(self) -> tuple[int, ...]:

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 
 from grounded.compile import Backward, Problem, Swarm, System, deepest
 from grounded.compile.problem import Controls, Samples
-from grounded.compile.run.interpreted import linearised, rolled_out, sweep, trajectory_cost
-from grounded.frozen import Array, readonly, wrapped
+from grounded.compile.run.interpreted import linearised, rolled_out, sweep
+from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
 from grounded.rollout import SETTLED, Rollout, seen_late
 from grounded.search.planner import predicted
@@ -177,27 +177,27 @@ def runs(problems: Sequence[Problem], policies: Sequence[Policy]) -> list[Rollou
         problem = replace(problem, fed_back=deepest(problem.depths, policy.depths))
     angles, n = tuple(map(bool, problem.angles)), system.n
     laid = [p.laid_out(system.states, angles, problem.depths) for p in policies]
-    sent, bias = np.array([p.feedforward for p in laid]), np.array([p.bias for p in problems])
-    K, aim = np.array([p.gain for p in laid]), np.array([p.reference for p in laid])
-    found = _run(problem, system, sent, K, aim, bias)
-    z = found[0]
+    each = replace(problem, system=system, bias=np.array([p.bias for p in problems]))
+    sent, K, aim = (
+        np.array([getattr(p, name) for p in laid]) for name in ("feedforward", "gain", "reference")
+    )
+    ones = np.ones(len(laid))
+    found = system.runs(each, Controls(sent, K, aim), ones)
     left = np.arange(len(laid) if problem.age else 0)
     for _ in range(problem.horizon):  # as in `simulate`, each until it agrees with what was seen
         if not len(left):
             break
-        late = [seen_late(run[:-1, :n], problem.age / problem.dt, angles) for run in z[left]]
+        late = [seen_late(run[:-1, :n], problem.age / problem.dt, angles) for run in found.z[left]]
         seen = aim.copy()
         seen[left, :, :n] -= late
-        again = _run(problem, system, sent, K, seen, bias)
-        scale = 1.0 + np.abs(again[0][left]).max(axis=1, keepdims=True)
-        moved = (np.abs(again[0][left] - z[left]) > SETTLED * scale).any(axis=(1, 2))
-        for before, after in zip(found, again, strict=True):
-            before[left] = after[left]
+        again = system.runs(each, Controls(sent, K, seen), ones)
+        scale = 1.0 + np.abs(again.z[left]).max(axis=1, keepdims=True)
+        moved = (np.abs(again.z[left] - found.z[left]) > SETTLED * scale).any(axis=(1, 2))
+        for name in ("z", "u", "cost"):
+            getattr(found, name)[left] = getattr(again, name)[left]
         left = left[moved]
-    each = zip(*(readonly(one) for one in found), strict=True)
-    return [
-        Rollout(run, u, -float(cost) if np.isfinite(cost) else -np.inf, n) for run, u, cost in each
-    ]
+    utilities = np.where(np.isfinite(found.cost), -found.cost, -np.inf).tolist()
+    return [Rollout(*run, n) for run in zip(found.z, found.u, utilities, strict=True)]
 
 
 def _with_each_law(systems: Sequence[Corrected]) -> Corrected:
@@ -207,30 +207,3 @@ def _with_each_law(systems: Sequence[Corrected]) -> Corrected:
         return first
     law = np.stack([one.law for one in systems], axis=1)
     return Corrected(first.base, law, first.x, first.u, first.before)
-
-
-def _run(
-    problem: Problem, system: Corrected, sent: Array, K: Array, aim: Array, bias: Array
-) -> tuple[Array, Array, Array]:
-    """Return z (P, H + 1, nz), inputs (P, H, m) and the costs (P,) of closed loops.
-
-    Args:
-        problem: the problem that predicts the runs.
-        system: its system.
-        sent: feedforward inputs (P, H, m).
-        K: gains (P, H, m, nz).
-        aim: reference of z (P, H, nz).
-        bias: what is added to the states in each step (P, H, n).
-    """
-    queue, n, H = problem.queue, system.n, problem.horizon
-    z, u = np.empty((len(sent), H + 1, problem.nz)), np.empty((len(sent), H, system.m))
-    z[:, 0] = problem.z_start()
-    with np.errstate(all="ignore"):
-        for t in range(H):
-            off = wrapped(z[:, t] - aim[:, t], problem.angles)
-            fed_back = (K[:, t] @ off[:, :, None])[:, :, 0]
-            u[:, t] = np.clip(sent[:, t] + fed_back, problem.low, problem.high)
-            received = problem.received(z[:, t], u[:, t], t)
-            z[:, t + 1, :n] = system.stepped(problem, z[:, t, :n], received, t) + bias[:, t]
-            z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
-        return z, u, trajectory_cost(problem, z, u)

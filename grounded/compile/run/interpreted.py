@@ -213,20 +213,23 @@ def rolled_out(
     by: Controls,
     alphas: Array,
 ) -> Swarm:
-    """`System.runs` with a step from x (A, n), received inputs (A, m) and t to the next x."""
+    """`System.runs` with a step from x (A, n), received inputs (A, m) and t to the next x.
+
+    Each run may have a policy and a bias of its own, (A, ...), or all the same ones.
+    """
     ubar, K, zbar, k = by
     queue, n, runs = problem.queue, problem.system.n, len(alphas)
     z = np.empty((runs, problem.horizon + 1, problem.nz))
     u = np.empty((runs, problem.horizon, problem.system.m))
-    z[:, 0] = problem.z_start()
+    z[:, 0], u[:] = problem.z_start(), ubar if k is None else ubar + alphas[:, None, None] * k
     with np.errstate(all="ignore"):
         for t in range(problem.horizon):
-            u[:, t] = ubar[t] if k is None else ubar[t] + alphas[:, None] * k[t]
             if K is not None and zbar is not None:
-                u[:, t] += wrapped(z[:, t] - zbar[t], problem.angles) @ K[t].T
+                off = wrapped(z[:, t] - zbar[..., t, :], problem.angles)
+                u[:, t] += (K[..., t, :, :] @ off[:, :, None])[:, :, 0]
             u[:, t] = np.clip(u[:, t], problem.low, problem.high)
             sent = problem.received(z[:, t], u[:, t], t)
-            z[:, t + 1, :n] = step(z[:, t, :n], sent, t) + problem.bias[t]
+            z[:, t + 1, :n] = step(z[:, t, :n], sent, t) + problem.bias[..., t, :]
             z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
     return Swarm(z, u, trajectory_cost(problem, z, u))
 
