@@ -12,8 +12,6 @@ starts, and the plan with the lowest cost is taken:
                      best plan so far with a disturbance ("kick"), which leads to other optima
     early plans      every other one of these: plans that reach the final state early and stay
                      there. The optimum of a quick swing-up is too narrow to be found by chance
-    wider friction   an adopted dry friction with a wider transition, narrowed step by step:
-                     a joint that sticks has no slope
 
 A simulator (`System.simulated`) takes a second an iteration. There a plan is improved until an
 iteration promises less than ROUGH of its cost or gains less than ROUGH^2 of what standing still
@@ -24,7 +22,7 @@ makes wrong: smaller promises are often not kept, and such a search would go on 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -51,8 +49,6 @@ WORSE = 1.01  # factor of the best cost above which a plan counts as another opt
 WORK = 4e7  # budget for all rivals of the reference: iterations x H x (n + m)^2
 SKETCH, PROMISING = 40, 1.3  # after so many iterations, a plan above this factor is dropped
 MORE_WORK = 2e8  # budget for FURTHER_STARTS, in the same units
-WIDER = (64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0)  # factors on the speed a dry friction builds up over
-FOLLOWED = 200  # iterations of DDP for each of them
 ROUGH = 1e-3  # relative gain of an iteration below which a simulator's plan is done
 DAMPED = 4  # halvings of a simulator's damped step: more damping costs it less than more runs
 FEWEST = 10  # a rival is not started with fewer iterations than this
@@ -64,7 +60,7 @@ Start = tuple[Array, Array | None, Array | None]  # inputs, feedback and its ref
 
 
 def first_policy(
-    task: Task, caution: int = 0, tick: Tick | None = None, widths: Sequence[str] = ()
+    task: Task, caution: int = 0, tick: Tick | None = None
 ) -> tuple[Policy, ddp.Solution]:
     """Return the best converged plan of the crude model, as a policy.
 
@@ -73,7 +69,6 @@ def first_policy(
         caution: how often a first policy has crashed; each crash multiplies the input penalties by
             CAUTION.
         tick: called with a line of progress about once a second.
-        widths: names of model parameters that are speeds over which a dry friction builds up.
 
     Returns:
         The policy, and the DDP result that it is made from; its `status` says whether the plan has
@@ -101,8 +96,6 @@ def first_policy(
         best = _better(found, best)
     if elsewhere and share >= FEWEST and task.model.system.how == "compiled":
         best = _hopped(task, problem, best, most, tick)
-    if widths and task.model.system.how == "compiled":
-        best = _better(_followed(task, widths, tick), best)
     if best.status == "max iterations" and len(best.trace) < ITERATIONS:
         more = finished(problem, best.u, best.K, best.z[:-1], tick=tick)
         best = replace(more, trace=(*best.trace, *more.trace))
@@ -124,21 +117,6 @@ def cautious(task: Task, caution: int) -> Task:
         input_change=np.maximum(task.reward.input_change, least) * CAUTION**caution,
     )
     return replace(task, reward=reward)
-
-
-def _followed(task: Task, widths: Sequence[str], tick: Tick | None) -> ddp.Solution:
-    """Plan with dry friction that builds up slowly, and re-solve while it gets sharper."""
-    found: ddp.Solution | None = None
-    for factor in WIDER:
-        wider = {name: factor * task.model.params[name].value for name in widths}
-        easier = replace(task, model=task.model.with_values(wider))
-        if found is None:
-            _, found = first_policy(easier, tick=tick)
-        else:
-            start = (found.u, found.K, found.z[:-1])
-            found = finished(easier.problem(), *start, most=FOLLOWED, tick=tick)
-    assert found is not None
-    return found
 
 
 def _hopped(

@@ -154,7 +154,7 @@ class About:
         for step in options.steps_from(first):
             if step.damping not in directions:
                 found = direction(
-                    make.planner.aim,
+                    make.planner.engaged,
                     self.theta,
                     self.grounding,
                     options,

@@ -103,28 +103,6 @@ class Planner:
         model = self.plan.model.with_values(dict.fromkeys(self.plays, 0.0))
         return self.plan.with_model(model)
 
-    @cached_property
-    def aim(self) -> Task:
-        """The planning task with terminal weights on true values beside filtered or late ones.
-
-        Trials are judged by the log. But a plan with terminal weights on filtered states alone
-        makes abrupt inputs in its last steps, so that the filter shows rest while the robot moves.
-        With weights on true values alone a log that is 30 ms late shows a robot that still brakes:
-        the smoother the plan, the better it was judged.
-        """
-        n, names = self.task.model.n, self.plan.model.state_names
-        if len(names) == n:
-            return self.engaged
-        from grounded.places import true_values
-
-        terminal, target = self.plan.reward.terminal.copy(), self.plan.target.copy()
-        for true, logged in true_values(names, names[n:]).items():
-            if terminal[logged] > 0:
-                terminal[true] = terminal[logged]
-                target[:, true] = target[:, logged]
-        goals = dataclasses.replace(self.plan.reward, terminal=terminal)
-        return dataclasses.replace(self.engaged, target=target, reward=goals)
-
     def lift(self, trial: Trial) -> Trial:
         """Return a trial with the planning model's memory states added."""
         plan, base = self.plan.model, self.task.model
@@ -176,10 +154,10 @@ class Planner:
         from grounded.search.first_policy import cautious, first_policy
         from grounded.solve.ddp import sweep
 
-        policy, found = first_policy(self.aim, caution, tick, self.widths)
+        policy, found = first_policy(self.engaged, caution, tick)
         if policy.gain is None or (self.plan.model.n == self.task.model.n and not self.widths):
             return policy, found
-        task, n, K = cautious(self.aim, caution), self.task.model.n, found.K
+        task, n, K = cautious(self.engaged, caution), self.task.model.n, found.K
         problem = task.problem()
         if self.widths:
             problem = self.dearer(task.problem(exact=True), 1.0)

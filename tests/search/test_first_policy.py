@@ -9,7 +9,6 @@ import grounded as gr
 from grounded.experiments.car_tasks import NAMES, car_task
 from grounded.experiments.figure8 import flight_task
 from grounded.experiments.pendulum import pendulum_task
-from grounded.model import Model
 from grounded.models import aircraft, car, pendulum
 from grounded.search.first_guess import first_guess, trim
 from grounded.search.first_policy import first_policy
@@ -81,26 +80,6 @@ def test_a_derivative_without_a_number_is_told_by_its_names():
     assert "test_first_policy.py" in told
 
 
-def test_the_end_is_asked_of_the_true_speed():
-    """A cart moves 0.4 m in 1.2 s; its speed sensor has a filter."""
-    model = Model(
-        states={"x": "m", "v": "m/s"},
-        inputs={"force": "N"},
-        derivative=lambda s, a, p: {"x": s.v, "v": 2.0 * a.force - 0.5 * s.v},
-    )
-    way = np.clip(np.arange(61) / 50, 0.0, 1.0)
-    x = 0.4 * way**2 * (3 - 2 * way)
-    target = np.column_stack([x, np.gradient(x, 0.02)])
-    weights = {"terminal": [500.0, 50.0], "change": 1e-4}
-    task = plain_task(model, 0.02, target, [10.0, 0.5], 10.0, **weights)
-    planner = planner_with(task, [("sensor_lag:v", {"tau": 0.04})])
-    policy, _ = planner.first_policy()
-    run = predicted(planner.plan.problem(exact=True), policy)
-    true = run.states[-1, planner.plan.model.state_names.index("v_true")]
-    assert abs(true) < 0.02 and abs(run.states[-1, 0] - 0.4) < 0.005
-    assert np.abs(run.inputs[-3:]).max() < 0.5 * np.abs(run.inputs).max()
-
-
 def test_a_limit_below_the_width_of_smoothing_is_planned_through():
     """A warehouse robot's first plan used 0.035 of a limit of 0.05: -85.6 in place of -0.004."""
     effects = [("rate_limit:linear", {"r": 0.7}), ("rate_limit:angular", {"r": 3.0})]
@@ -150,7 +129,7 @@ def test_a_planner_remembers_what_earlier_policies_feed_back(late):
     planner, policy = late
     play = with_play(0.1)
     more = play.feeding_back([policy])
-    assert more.plan.problem().depths == more.aim.problem().depths == (1, 3)
+    assert more.plan.problem().depths == more.engaged.problem().depths == (1, 3)
     assert more.fingerprint == play.fingerprint and more.plays == play.plays
     assert planner.feeding_back([policy]) is planner
 
