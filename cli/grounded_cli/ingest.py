@@ -63,8 +63,7 @@ def tell_ingested(name: str, one: Ingested, details: bool, earlier: Sequence[Fin
         gained = "no utility" if ended else f"utility {number(one.utility)}"
         if one.runs > 1 and number(one.mean) != number(one.utility) and math.isfinite(one.mean):
             gained += f" (mean of its {one.runs} runs: {number(one.mean)})"
-        early = one.verdict == "crashed" and one.then.verb == "discard"
-        text = f"{gained}, {'ended early' if early else one.verdict}"
+        text = f"{gained}, {one.verdict}"
         text = ASIDE if one.verdict == ASIDE and ended else text
         show(field(one.candidate, text, "  "))
     if one.off_target:

@@ -88,7 +88,7 @@ def report_text(findings: Findings) -> str:
         more = f"({left} more: {rendered(NextCommand('status'), findings.folder)})"
         spark = sparkline([tried.utility for tried in history if tried.utilities])
         lines += _indented(filter(None, (more * bool(left), spark)))
-    lines += _indented([f"{now.outcome}: {findings.outlook}"])
+    lines += _indented([f"{now.outcome}: {now.sentence}"])
 
     # errors by state, and what was diagnosed
     for block in error_table(findings):

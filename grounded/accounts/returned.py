@@ -65,7 +65,6 @@ class Kind(Enum):
     UNIT = "columns of the log times a factor"
     LOG = "another fault of the log"
     PROGRAM = "the program misused its candidate"
-    ROBOT = "the robot acted otherwise than it was told"
     FELL = "the run failed before the log ends"
     CANDIDATE = "another candidate ran"
     EARLIER = "a candidate of an earlier task ran"

@@ -254,7 +254,7 @@ class Tried(Result):
     def verdict(self, last: bool = True) -> str:
         """Return the verdict: first, better, no better, crashed; or why it is undecided.
 
-        That of a candidate whose last run is to be discarded is "ended early" or "in doubt".
+        That of a candidate whose last run is to be discarded is "in doubt".
 
         It is "maybe better" if its runs were better, but by no more than they may scatter.
 
@@ -263,7 +263,7 @@ class Tried(Result):
                 trial" instead of "waiting".
         """
         if self.asked:
-            return "ended early" if self.crashed else "in doubt"
+            return "in doubt"
         if self.in_doubt:
             return "in doubt"
         if self.accepted is None:

@@ -34,7 +34,7 @@ from small_tasks import cart, cart_task
 from stepped import logged, stepped
 
 FIGURES = ("utility", "paths", "states", "inputs", "error", "bias")
-FIGURES += ("forecast", "residual")
+FIGURES += ("forecast",)
 
 
 @pytest.mark.slow

@@ -140,7 +140,7 @@ def test_a_workspace_of_data_only_shows_the_model_against_the_data(cart, tmp_pat
         assert grounded("-C", folder, "ingest", path, "--data").code == 0
     done = grounded("-C", folder, "report", "--html", "--png", "--rrd", "--json")
     assert done.code == 0, done.err
-    names = ["paths", "data-t0001", "data-t0002", "residual"]
+    names = ["paths", "data-t0001", "data-t0002"]
     assert [Path(p).stem for p in done.json["paths"]["png"]] == names
     shown = Path(done.json["paths"]["html"]).read_text()
     assert "t0001" in shown

@@ -5,9 +5,9 @@ from __future__ import annotations
 from grounded.findings.catalogue.entry import Entry, aside, note, refuse, warn
 
 # how a run went can't be judged by a wrong log
-JUDGED: tuple[str, ...] = ("run.reversed", "run.early", "run.safety", "run.start")
+JUDGED: tuple[str, ...] = ("run.reversed", "run.safety", "run.start")
 # of a run that its program spoilt, neither its end nor its motion says anything of the candidate
-OUTCOME: tuple[str, ...] = ("run.reversed", "run.early", "run.failed", "run.safety")
+OUTCOME: tuple[str, ...] = ("run.reversed", "run.failed", "run.safety")
 SPOILT = (*OUTCOME, "run.start")  # of a log that is taken as a run all the same
 # what a program should do that sends other commands than those of the candidate
 CALL = (
@@ -86,10 +86,6 @@ LOG: dict[str, Entry] = {
         "{about} is read without a scale from a column in {unit}, but the model has {own}",
         "set scale = {by:.6g} in {table}, if so",
     ),
-    "unread": note(
-        "{about} is in [log], but not in [estimate] measured: an estimate is used",
-        "to use it, add {about} = its scatter at standstill there",
-    ),
     "limits": warn(
         "{about} goes up to {most} beyond its [limits], {limits}",
         "{how:clip=log the commands after clipping,flip=its scale in [log] is negative: multiply "
@@ -99,19 +95,13 @@ LOG: dict[str, Entry] = {
     "gaps": warn(
         "{samples} lost samples were interpolated, the longest gap is {longest} of {about} at {at}"
     ),
-    "short": warn(
-        "the log ends after {steps} of {horizon} steps[[, {missing:.3g} ms before the plan's last "
-        "state]]: the rest is extrapolated",
-        "log at least one more row after the last command",
-    ),
     "still": warn(
         "no state changes in it: was the robot switched on, and are these its columns?",
         "`discard {trial}` sets it aside",
     ),
     "late_states": refuse(
         "the run starts {late} before every state is known",
-        "start recording before the run[[, and remove {put_off} unless the clocks differ]]; or "
-        "ingest it with --data",
+        "start recording before the run, or ingest it with --data",
     ),
     # where a run begins
     "from": note(
@@ -158,11 +148,6 @@ LOG: dict[str, Entry] = {
         "{side:late=early,early=late}",
     ),
     # stored before
-    "before": note(
-        "it was stored before, as {about} ({ran}), which is set aside[[used? : it is used as that "
-        "again]]",
-        "if it ran another candidate, name that with --candidate ID",
-    ),
     "aside": warn(
         "{about} stays set aside and does not count: `restore {about}` undoes that",
         "[[if you don't want that, run {waits} and record another log]]",
@@ -173,8 +158,7 @@ LOG: dict[str, Entry] = {
     ),
     "stored": refuse(
         "{about} is stored already, as {trial}[[ ({used})]][[other?, read in another way]]",
-        "[[pass the log of the run of {waits}]][[both?, or, ]][[wanted? if it is {wanted}, "
-        "discard {trial} and ingest it again]][[other? discard {trial} and ingest it again]]",
+        "[[pass the log of the run of {waits}, or ]]discard {trial} and ingest it again",
     ),
     "not_estimated": refuse(
         "the smoother finds no finite states for this log ({why})",
@@ -260,22 +244,16 @@ RUN: dict[str, Entry] = {
         "Then[[ `discard {trial}`,]] mend it and run again; otherwise `propose` goes on",
         hides=(*OUTCOME[1:], "log.limits"),
     ),
-    "early": aside(
-        "all states are known for {steps} of {horizon} steps only[[, {silent} not after that]]; "
-        "until then it ran as predicted: was the recording cut off, or the robot stopped?",
-        "`discard {trial}` and run {ran} again; if it crashed, `propose` goes on",
-        hides=SPOILT[2:],
-    ),
     "failed": warn(
         "the run ended after {steps} of {horizon} steps[[large? , with values that are too "
-        "large]]: a failed candidate[[ ({silent} unknown after that)]]",
+        "large]]: a failed candidate",
         "[[`discard {trial}` if you stopped it, or if only the recording was cut]]",
     ),
     "fell": warn(
         "{about} left [safety] {bound} at {at} (it was {was}, {predicted} was predicted), and "
         "then the commands were no longer those of {ran}: a failed run, cut at {until}",
         "if something disturbed it, `discard` it",
-        hides=("run.early", "run.failed", "run.safety"),
+        hides=("run.failed", "run.safety"),
     ),
     # its start
     "start_spoils": aside(

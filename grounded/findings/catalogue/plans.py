@@ -204,7 +204,6 @@ SEARCH: dict[str, Entry] = {
         "the model alone reaches {promised:.4g}, {by:.3g} more than the {real:.4g} of {best}", MODEL
     ),
     "diagnose": note(MODEL),
-    "adopt_first": note("a better model may gain more: adopt what this one lacks"),
     # what status tells beside it
     "uncounted": note(
         "{about} {about:counts/count} only as data, for fit and diagnose: {about:it/they} ran "

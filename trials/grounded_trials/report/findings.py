@@ -28,7 +28,7 @@ from grounded_trials.report.forecast import SECONDS
 from grounded_trials.store.store import Lost
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.last_diagnosis import Since
-from grounded_trials.workspace.next_step import BEFORE_TRIALS, outlook
+from grounded_trials.workspace.next_step import BEFORE_TRIALS
 from grounded_trials.workspace.off_target import tracking_error
 
 if TYPE_CHECKING:
@@ -61,7 +61,6 @@ class Log:
 
     trial: Trial
     residual: Array  # (T, n), as a run's
-    explained: Array | None = None  # (T, n), as a run's; of the last log only
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,11 +88,6 @@ class Findings:
     def next_command(self) -> str:
         """The next command, with the workspace as the user named it."""
         return rendered(self.then, self.folder)
-
-    @property
-    def outlook(self) -> str:
-        """The sentence on the search, and whether another model may go on with it."""
-        return outlook(self.standing, self.then).sentence
 
     @property
     def told(self) -> Told | None:

@@ -47,7 +47,6 @@ def gather(workspace: Folder) -> Findings:
     own = [t for t in fitting if t.candidate in known]
     data = [t for t in fitting if not t.candidate]
     now = _standing(workspace, contents)
-    logs = [_drawable(t) for t in data]
 
     # the last diagnosis, and the model with what it found
     diagnosis: Diagnosis | None = None
@@ -70,7 +69,7 @@ def gather(workspace: Folder) -> Findings:
         method=_method(workspace),
         standing=now,
         runs=tuple(_runs(task, now, own, better, lost)),
-        logs=tuple(_log(task, t, better if t is logs[-1] else None) for t in logs),
+        logs=tuple(Log(t, _residual(Planner(task, task), t)) for t in map(_drawable, data)),
         lost=tuple(lost),
         diagnosis=diagnosis,
         then=Situation(workspace, now).then,
@@ -114,11 +113,6 @@ def _runs(
         explained = None if better is None else _residual(better.planner, trial)
         runs.append(Run(trial, tried.candidate, tried.accepted, utility, residual, explained))
     return runs
-
-
-def _log(task: Task, trial: Trial, better: Better | None) -> Log:
-    explained = None if better is None else _residual(better.planner, trial)
-    return Log(trial, _residual(Planner(task, task), trial), explained)
 
 
 def _drawable(trial: Trial) -> Trial:

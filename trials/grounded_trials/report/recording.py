@@ -96,7 +96,7 @@ def texts(findings: Findings) -> dict[str, str]:
         f"**{findings.name}**, {about(findings)}; {'; '.join(counted(findings))}",
         *(f"{value}: {what}" for value, what in improved(findings)),
         colours,
-        f"**{findings.standing.outcome}**: {findings.outlook}",
+        f"**{findings.standing.outcome}**: {findings.standing.sentence}",
         *(f"**left out**: {one.file}: {one.reason}" for one in findings.lost),
     ]
     verdict, said = [f"next: `{findings.next_command}`", *findings.lines], findings.told

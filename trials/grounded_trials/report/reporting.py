@@ -56,7 +56,7 @@ class Report(Result):
             "paths": {p.suffix[1:]: str(p) for p in self.paths if p.suffix != ".png"},
             "utilities": findings.standing.utilities,
             "phase": findings.standing.phase,
-            "sentence": findings.outlook,
+            "sentence": findings.standing.sentence,
             "ending": findings.standing.ending or None,
             "lost": [vars(one) for one in findings.lost],
             "next": rendered(findings.then, findings.folder),

@@ -40,7 +40,7 @@ MEASURES = {  # of a run, see `measures`
     "prediction_error": "off prediction",
     "bias_rate": "bias in 1 s",
 }
-AHEAD = ("forecast", "data-", "residual")  # names of figures of forecasts and residuals
+AHEAD = ("forecast", "data-")  # names of figures of forecasts
 OPEN = 12  # largest number of candidates whose table is shown unfolded
 
 

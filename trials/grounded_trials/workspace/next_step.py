@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import found
 from grounded.search.standing import LOST, Ending, Phase, Standing
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -203,14 +202,6 @@ NEXT: tuple[Row, ...] = (
 )
 
 
-def outlook(now: Standing, then: NextCommand) -> Standing:
-    """Return the standing; of a search that has ended, also that the model may change."""
-    goes_on = now.phase in (Phase.PROPOSE, Phase.AWAIT)
-    if then.verb == "adopt" and not goes_on:
-        return now.with_finding(found("search.adopt_first", then=then))
-    return now
-
-
 def not_ingested(workspace: Folder) -> str:
     """Return the log that the workspace was made from if nothing was stored or planned yet; or "".
 
@@ -267,16 +258,10 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
 def after_diagnosis(workspace: Folder, found: Diagnosis) -> NextCommand:
     """Return the command after a diagnosis: adopt claims, run another trial, or read the report."""
     here = Situation(workspace, _standing_ahead(workspace), found)
-    if not found.no_cause:
-        if here.adopt is not None:
-            return here.adopt
-        if found.probe:
-            return to_run(workspace, found.probe, found.probe)
-        settled = found.kind in ("none", "unknown") or found.doubt  # nothing to adopt
-        if not settled or not workspace.config.task.target:
-            return REPORT
-        return here.then
-    return here.record if undrawn(workspace) else here.run
+    if found.probe and not here.adopt:
+        return to_run(workspace, found.probe, found.probe)
+    drawn = workspace.config.task.target or here.adopt or found.no_cause
+    return here.then if drawn else REPORT
 
 
 def _standing_ahead(workspace: Folder) -> Standing:

@@ -23,7 +23,7 @@ from grounded.frozen import Array
 from grounded.result import listed
 from grounded.search.pictures import search_figure
 from grounded_trials.report.bodies import reading_order, scene_of
-from grounded_trials.report.figures.gap import forecast_figures, residual_figures
+from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
     ESTIMATED,
@@ -48,7 +48,7 @@ def all_figures(findings: Findings) -> tuple[Figure, ...]:
     made = [search_figure(findings.standing), *(draw(findings) for draw in runs)]
     if findings.diagnosis is not None:
         made += gap_figures(findings.diagnosis)
-    made += forecast_figures(findings) + residual_figures(findings)
+    made += forecast_figures(findings)
     return tuple(figure for figure in made if figure is not None)
 
 

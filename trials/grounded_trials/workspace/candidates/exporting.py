@@ -27,7 +27,7 @@ from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.policy import Policy, to_arrays
 from grounded.result import UNSAID, Document
-from grounded.search.standing import Ending, Phase, Standing
+from grounded.search.standing import Ending
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.candidates.handover import checked_candidate
 from grounded_trials.workspace.candidates.search_state import (
@@ -218,19 +218,13 @@ def export_candidate(
         write_atomically(program, Path(onboard.__file__).read_bytes())
     waiting = handed.check.standing.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
-    ended = _has_ended(workspace, identity, handed.check.standing)
+    now = handed.check.standing
+    with suppress(GroundedError):  # another candidate's file is damaged
+        now = known_end(workspace, workspace.read(), now) or now
+    best = now.incumbent is not None and now.incumbent.candidate.id == identity
+    ended = best and now.ending is not Ending.NONE
     told = (*handed.overridden, *handed.findings)
     return Exported(identity, path, form, program, told, ended, how)
-
-
-def _has_ended(workspace: Folder, identity: str, now: Standing) -> bool:
-    """Return whether the search is known to have ended with this candidate; nothing is planned."""
-    if now.incumbent is None or now.incumbent.candidate.id != identity:
-        return False
-    if now.phase is Phase.PROPOSE:
-        with suppress(GroundedError):  # another candidate's file is damaged
-            now = known_end(workspace, workspace.read(), now) or now
-    return now.ending is not Ending.NONE
 
 
 def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:

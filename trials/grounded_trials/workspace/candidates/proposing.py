@@ -33,7 +33,7 @@ from grounded_trials.workspace.candidates.search_state import (
 from grounded_trials.workspace.candidates.trust import Extent, much_noise
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import Since, left_out
-from grounded_trials.workspace.next_step import Situation, outlook, to_run
+from grounded_trials.workspace.next_step import Situation, to_run
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
 
 if TYPE_CHECKING:
@@ -299,7 +299,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     ]
     best = standing.incumbent
     return Status(
-        outlook(standing, then),
+        standing,
         then,
         settle(every),
         _certainty(standing),

@@ -18,6 +18,7 @@ from grounded.search.candidate import Candidate, Tried
 from grounded.search.difference import missed_by_start
 from grounded.search.step_size import Step
 from grounded.task import Task
+from grounded_trials.workspace.off_target import roles_of, tracked
 
 if TYPE_CHECKING:
     from grounded.search.standing import Standing
@@ -63,16 +64,13 @@ def extent_of(made: Candidate, task: Task) -> tuple[Extent, ...]:
 
 def _main_states(task: Task) -> set[str]:
     """Return the states whose range is told: the position; else those in [safety] or a target."""
-    model, position = task.model, task.model.roles.get("position", ())
-    where = {position} if isinstance(position, str) else {*position}
-    if where & {*model.states}:
-        return where
     assert task.safety_low is not None and task.safety_high is not None
     bounded = np.isfinite(task.safety_low) | np.isfinite(task.safety_high)
-    guarded = {name for name, one in zip(model.state_names, bounded, strict=True) if one}
-    tracked = zip(model.state_names, (task.target == task.target).any(axis=0), strict=True)
-    wanted = [name for name, given in tracked if given and name not in guarded]
-    return {*guarded, *wanted[:STATES]}
+    found = roles_of(task.model).get("position") or [
+        *np.flatnonzero(bounded),
+        *tracked(task)[:STATES],
+    ]
+    return {task.model.state_names[i] for i in found}
 
 
 def made_how(made: Candidate, task: Task, history: tuple[Tried, ...]) -> Finding:

@@ -8,9 +8,7 @@ A run whose commands are its candidate's to the last digits, and whose motion is
 prediction, came about as it is logged: no story of its log or of its program is asked for then.
 
 A log does not tell whether the robot crashed at its end, somebody stopped it, or only the recording
-ended. But a robot that crashes leaves its prediction or [safety] first. If it was as near to its
-prediction at the end as before, and was not about to leave [safety], the candidate should not count
-as failed: the next plan would shrink from it.
+ended: it counts as failed, unless the user discards it.
 
 By how much a start away from [task] start changes the utility, the model says: it runs the
 candidate from there and from s_0. A run whose utility it changes much says nothing about its
@@ -36,7 +34,6 @@ from grounded.accounts.sent import (
     as_planned,
     follows,
     latest,
-    like_predicted,
 )
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.frozen import Array, median
@@ -50,15 +47,11 @@ from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.last_diagnosis import diagnosable
 
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
-NO_CRASH = 0.05  # of a state's range in the prediction: a smaller distance from it is no crash
-GROWN = 1.5  # times as far from the prediction at the end as before: farther off is no usual end
 START_IS_OFF = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
 TOLD, SPOILT = 0.05, 0.5  # share of the run's cost by which the start changes it: told; too much
 FEWEST = 2  # runs from which it is told how exactly the robot is placed
 MEDIAN_TO_STD = 1.4826  # of the size of a normal variable
 RECENT = 50  # runs that are looked at; the way of placing a robot may change
-# last steps, in most of which a state has to be that far off: noise is not
-END = STEPS_TO_JUDGE // 2
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,22 +107,19 @@ class Run:
         known = self.trial.candidate in self.workspace.candidate_ids()
         return known and as_planned(self.own, self.whole.until(self.own.policy.horizon))
 
-    def shown(
-        self, *, own: bool, doubted: bool = False, silent: Sequence[str] = ()
-    ) -> Iterator[Finding | None]:
+    def shown(self, *, own: bool, doubted: bool = False) -> Iterator[Finding | None]:
         """Yield what it shows of its log, its program, its start and its motion.
 
         Args:
             own: it was written by grounded, and not read through [log].
             doubted: its candidate was named against its commands.
-            silent: states without a value in the rest of its log, where others have some.
         """
         yield from self.log_faults(own=own)
         if self.trial.candidate and not (self.as_planned or doubted):
             yield self.ran_otherwise()
         yield self.begun_elsewhere() if self.trial.candidate else None
         yield self.gone_wrong()
-        yield self.ended_early(silent) if self.trial.candidate else None
+        yield self.ended_early() if self.trial.candidate else None
 
     def log_faults(self, *, own: bool = False) -> tuple[Finding, ...]:
         """Return the faults of its columns; none are looked for if it came about as logged."""
@@ -254,47 +244,13 @@ class Run:
         inside = self.workspace.task.inside_safety(states)
         return np.asarray((states != inside).any(axis=1))
 
-    def ended_early(self, silent: Sequence[str]) -> Finding | None:
-        """Return that it ended early; None if it did not.
-
-        Args:
-            silent: states without a value in the rest of its log, where others have some.
-        """
+    def ended_early(self) -> Finding | None:
+        """Return that it ended early; None if it did not."""
         horizon, run = self.workspace.task.horizon, self.whole
         if run.steps >= horizon or run.whole(horizon) is not run:
             return None
-        complete = tuple(
-            one.id
-            for one in self.workspace.task_trials()
-            if one.candidate == self.own.id and one.whole(horizon).finite_steps >= horizon
-        )
-        return found(
-            "run.early" if self._as_before() else "run.failed",
-            ran=self.own.id,
-            trial=run.id,
-            steps=run.steps,
-            horizon=horizon,
-            silent=tuple(silent),
-            complete=complete,
-        )
-
-    def _as_before(self) -> bool:
-        """Return whether it was as near to its prediction at its end as before, inside [safety].
-
-        A robot that crashes stays off its prediction. Noise, and what feedback makes of it, moves
-        one state or another off it farther than ever before, but only for a moment.
-        """
-        run, said = self.whole, self.own.predicted_states
-        least = max(run.steps, 2 * STEPS_TO_JUDGE)
-        if run.finite_steps < least or not like_predicted(self.own, run):
-            return False
-        off = np.abs(self.workspace.task.model.difference(run.states, said[: len(run.states)]))
-        far = GROWN * off[:-STEPS_TO_JUDGE].max(axis=0)
-        known = np.maximum(far, NO_CRASH * np.ptp(said, axis=0))
-        # as many steps later, at the same rate
-        soon = 2 * run.states[-1] - run.states[-1 - STEPS_TO_JUDGE]
-        inside = not self._unsafe(np.vstack([run.states, soon])).any()
-        return inside and bool((median(off[-END:]) <= known).all())
+        told = found("run.failed", ran=self.own.id, trial=run.id)
+        return told.also(steps=run.steps, horizon=horizon)
 
 
 def placing(workspace: Folder, contents: Contents, but: str = "") -> tuple[Array, int]:

@@ -151,8 +151,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str) -> Ingeste
     run = Run(workspace, replace(read.trial, id=added.id))
     aside, ran = added.id in workspace.discarded(), bool(run.trial.candidate)
     told = [*read.findings, *_circumstances(run, read, before, aside=aside)]
-    told += _checked(run, read.last_s)
-    told += filter(None, run.shown(own=read.own, doubted=read.doubted, silent=read.silent))
+    told += _checked(run)
+    told += filter(None, run.shown(own=read.own, doubted=read.doubted))
     findings = settle(told)
     why = next((one for one in findings if one.weight is Weight.ASIDE and not aside), None)
     if why:  # `status` asks again
@@ -192,8 +192,6 @@ def _circumstances(run: Run, read: Read, before: str, *, aside: bool) -> Iterato
     if aside:
         waits = now.outstanding.id if now and now.outstanding else ""
         yield found("log.aside", run.trial.id, waits=waits)
-    if was := read.before:
-        yield found("log.before", was.stored.id, ran=was.trial.candidate or "data", used=not aside)
     if now and (changed := overtaken(workspace, ran=True)):
         yield changed.weighing(Weight.WARN)
 
@@ -217,14 +215,8 @@ def _verdict(run: Run) -> str:
 # --- what a trial lacks or exceeds ---------------------------------------------------------------
 
 
-def _checked(run: Run, last_s: float = math.nan) -> Iterator[Finding]:
-    """Yield what a trial lacks or exceeds.
-
-    Args:
-        run: the trial as stored.
-        last_s: when the last of its states was logged, in seconds of the run; NaN if all are on the
-            control grid.
-    """
+def _checked(run: Run) -> Iterator[Finding]:
+    """Yield what a trial lacks or exceeds."""
     task, whole, filled = run.workspace.task, run.whole, run.bridged
     if filled.samples:
         longest, at = Quantity(filled.longest_s, "s"), Quantity(filled.at_s, "s")
@@ -237,9 +229,6 @@ def _checked(run: Run, last_s: float = math.nan) -> Iterator[Finding]:
         yield from _still(whole)
         yield from _beyond(run.workspace, whole)
         return
-    if whole.steps < task.horizon and whole.whole(task.horizon) is not whole:
-        missing = max(0.0, np.nan_to_num(1e3 * (task.horizon * task.dt - last_s)))
-        yield found("log.short", steps=whole.steps, horizon=task.horizon, missing=missing)
     yield from _beyond(run.workspace, run.run)
     if np.ptp(run.own.predicted_states, axis=0).any():
         yield from _still(run.run)

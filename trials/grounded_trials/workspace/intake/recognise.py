@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.accounts.levels import FINE, SMALL
+from grounded.accounts.levels import FINE
 from grounded.accounts.reported import scaled as scaled_columns
 from grounded.accounts.returned import (
     OTHERS,
@@ -123,10 +123,6 @@ class Case:
             return replace(seen, why=None, other="")
         if sender.other:
             return replace(seen, why=sender.why, other=sender.other)
-        if start and self.guessed and seen.why and sender.own and sender.own.left < SMALL:
-            # a program that differentiates positions has speeds that lag the estimated ones
-            self._cut(stored, start)
-            return replace(self._judged(), why=None, other="")
         return seen
 
     def _cut(self, stored: ForeignLog, start: Start) -> None:
@@ -137,8 +133,7 @@ class Case:
         )
         if self.apart and self.log and stored.recording:
             begins += (self.log.whole.origin_ns - stored.recording.whole.origin_ns) * 1e-9
-        self.read = replace(cut_log(stored, self.ran, begins), before=self.read.before)
-        self.read = self.read.telling(*kept)
+        self.read = cut_log(stored, self.ran, begins).telling(*kept)
         cut = self.apart.cut(self.ran, start.seconds)[0] if self.apart else self.read.trial
         self.whole = interpolate_gaps(cut).trial
 
@@ -212,8 +207,8 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
         if not case.seen.why and story.kind is Kind.UNKNOWN:
             return cut_short(read, *fell) if fell else read
         story = likeliest([story, *_of_log(case)], case.as_logged)
-    if story.kind in (Kind.UNKNOWN, Kind.PROGRAM):  # neither says how the robot moved
-        story = next(_of_motion(case, story), story)
+    if story.kind is Kind.UNKNOWN:  # it says nothing of how the robot moved
+        story = next(_of_columns(case, case.columns), story)
     if story.kind is Kind.FELL and fell:
         return cut_short(read, *fell)
     story = _where(case, story)
@@ -257,22 +252,6 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
     return some
 
 
-def _of_motion(case: Case, story: Story) -> Iterator[Story]:
-    """Yield what the motion tells of a log whose commands only a program explains, or nothing.
-
-    Feedback with the wrong sign drives the states away from the prediction, so that the commands
-    soon stay at their limits and do not tell where the run began.
-    """
-    from grounded.search.run_motion import reversed_input
-
-    sent = case.log if case.whole.inputs.any() and not (case.rival or case.opens) else None
-    trial = sent.trial_from(sent.first) if sent else None
-    if trial and (turned := reversed_input(case.workspace.planner, trial, astray=True)):
-        yield replace(story, kind=Kind.ROBOT, finding=turned)
-    if story.kind is Kind.UNKNOWN:
-        yield from _of_columns(case, case.columns)
-
-
 def _of_columns(case: Case, odd: Sequence[Finding]) -> Iterator[Story]:
     """Yield the faults of columns that motion and kinematics show."""
     log = case.read.log
@@ -287,7 +266,7 @@ def _doubted(case: Case, read: Read, story: Story) -> Read:
     by_hand = log and not (case.opens or case.rival or case.silent)
     nobody = by_hand and case.seen.ran and not case.seen.ran.opens
     nobody = nobody and story.kind in (Kind.UNKNOWN, Kind.LOG)
-    aside = story.kind in (Kind.PROGRAM, Kind.ROBOT) or nobody
+    aside = story.kind is Kind.PROGRAM or nobody
     assert story.finding is not None
     doubts = [story.finding.weighing(Weight.ASIDE if aside else Weight.WARN)]
     if log and not case.opens:
@@ -328,15 +307,13 @@ def _where(case: Case, story: Story) -> Story:
 
 def _refusal(case: Case, story: Story) -> GroundedError:
     """Return the error of a log that is no run of its candidate as it is, and the next command."""
-    path, ran, kind, told = str(case.path), case.ran, story.kind, story.finding
+    path, kind, told = str(case.path), story.kind, story.finding
     data, then = NextCommand("ingest", (path, "--data")), case.again
     assert told is not None
     if kind is Kind.EARLIER:
         return _of_earlier(case.workspace, path, story.names[0])
     if kind is Kind.PROGRAM or story.rerun:
         then = NextCommand("next", ("LOG",))
-    elif kind is Kind.ROBOT:
-        then = NextCommand("export", (ran, "--runner"))
     elif kind is Kind.CANDIDATE and case.read.log:
         then = NextCommand("ingest", (path, "--candidate", case.seen.other))
     elif kind in (Kind.UNKNOWN, Kind.CANDIDATE):

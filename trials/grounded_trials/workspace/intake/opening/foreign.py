@@ -118,15 +118,8 @@ class ForeignLog:
         """
         dt = self.workspace.config.task.dt
         if grid.late_s > dt / 2:
-            put_off = tuple(
-                f"[log.state.{name}] delay_s = {one.spec.delay_s:g}"
-                for name, one in self.series.items()
-                if name in self.mapping.states and one.spec.delay_s < dt - grid.late_s
-            )
             late = Quantity(grid.late_s, "s")
-            raise GroundedError(
-                found("log.late_states", where=str(self.path), late=late, put_off=put_off)
-            )
+            raise GroundedError(found("log.late_states", where=str(self.path), late=late))
 
     @property
     def unlike_units(self) -> tuple[Finding, ...]:
@@ -162,11 +155,6 @@ class ForeignLog:
             return ()
         names, measured = self.workspace.base_model.state_names, self.estimate.measured
         return tuple(n for n in names if n in self.mapping.states and n not in measured)
-
-    @property
-    def unread(self) -> tuple[Finding, ...]:
-        """Such states, which only identify a run, while its trial has estimates."""
-        return tuple(found("log.unread", name) for name in self._beside)
 
     @cached_property
     def whole(self) -> Mapping[str, Series]:
@@ -328,17 +316,10 @@ def read_log_file(
     log = read_foreign(workspace, path, mapping_of(workspace, path).since(sent_before))
     ran = candidate or (log.stored[-1].trial.candidate if log.stored else "")
     refuse_as_another(workspace, path, log.stored, "" if data else candidate)
-    # the last trial, among those set aside, that was made from this log
-    aside = () if data or ran else workspace.aside_trials()
-    made = [t for t in aside if t.meta.get("source_sha256") == log.source["source_sha256"]]
-    before = made[-1] if made else None
-    if before and before.trial.candidate in workspace.candidate_ids():
-        ran = before.trial.candidate
     chosen = "" if data else ran or outstanding(workspace, path)
     if chosen:
         check_candidate(workspace, path, chosen)
-    read = cut_log(log, chosen)
-    return replace(read, before=before) if before and chosen == ran else read
+    return cut_log(log, chosen)
 
 
 def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read:
@@ -356,7 +337,6 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         (
             *misread(log.workspace.base_model, log.mapping),
             *log.unlike_units,
-            *log.unread,
             *remarks,
             *grid.findings,
             *(() if candidate else begun(grid, trial.dt, trial.input_names)),

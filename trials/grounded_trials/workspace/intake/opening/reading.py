@@ -7,13 +7,10 @@ policy that it ran, that must equal this workspace's candidate to the last bit.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError
@@ -28,7 +25,6 @@ from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
     ESTIMATED_WITH,
     READ_BY,
-    StoredTrial,
     other_task,
 )
 
@@ -36,9 +32,6 @@ if TYPE_CHECKING:
     from grounded_trials.logs.resample import Gridded
     from grounded_trials.logs.signal_report import SignalReport
     from grounded_trials.workspace.intake.opening.foreign import ForeignLog
-
-
-SILENT_S = 0.2  # [s] in which a log that goes on must have a value of a state
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +42,6 @@ class Read:
     data: bytes
     findings: tuple[Finding, ...] = ()
     doubted: bool = False  # ingested as a candidate's run although its commands differ
-    # the trial that was made from the log before and is set aside
-    before: StoredTrial | None = None
     log: ForeignLog | None = None
     cut: Gridded | None = None  # how a foreign log was sampled
 
@@ -67,21 +58,6 @@ class Read:
     def signals(self) -> tuple[SignalReport, ...]:
         """The signals of a foreign log."""
         return self.cut.reports if self.cut else ()
-
-    @property
-    def last_s(self) -> float:
-        """When all states of a foreign log were last known [s from the start]; else NaN."""
-        return 1e-9 * (self.cut.last_ns - self.cut.start_ns) if self.cut else math.nan
-
-    @property
-    def silent(self) -> tuple[str, ...]:
-        """The states without a value from the end of the trial on, though its log goes on."""
-        if self.log is None or self.cut is None:
-            return ()
-        ends = self.cut.start_ns + round(1e9 * (self.trial.steps * self.trial.dt + SILENT_S))
-        known = {n: one.t[np.isfinite(one.values)] for n, one in self.log.series.items()}
-        gone = [n for n, t in known.items() if t.max(initial=0) < ends]
-        return tuple(n for n in gone if len(gone) < len(known) and n in self.trial.state_names)
 
 
 def read_own_trial(workspace: Folder, path: Path, candidate: str | None, data: bool) -> Read:

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from grounded.accounts.levels import EXACT as TO_DIGITS
-from grounded.accounts.levels import FINE, HALF, SLIGHT, STEPS_TO_JUDGE
+from grounded.accounts.levels import FINE, HALF, STEPS_TO_JUDGE
 from grounded.accounts.sent import (
     WINDOWS,
     follows,
@@ -129,21 +129,11 @@ class Recording:
         """Find where a policy's run begins; return None if the log is too short."""
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        apart, strays = instants_apart(self.whole, self.parts, policy)
-        whole = self._starts(policy, apart)
-        if (found := self._surest(policy, whole)) is None:
-            few = np.where(strays < 0.5, strays, np.inf)
-            begun = [one for one in self._starts(policy, few) if one.opens_alike]
-            found = min(begun or whole, key=lambda one: (not one.alike, one.apart), default=None)
-        return found
+        starts = self._starts(policy, instants_apart(self.whole, self.parts, policy))
 
-    def _surest(self, policy: Policy, starts: Sequence[Start]) -> Start | None:
-        """Choose among likely starts where most commands are the policy's; None if there is none.
-
-        The mean difference is affected by other commands sent in place of the first steps, and by
-        commands at their limits, which contain no timing. The median on the samples that the
-        program acted on is not.
-        """
+        # The mean difference is affected by other commands sent in place of the first steps, and by
+        # commands at their limits, which contain no timing. The median on the samples that the
+        # program acted on is not.
         alike = [one for one in starts if one.alike]
         likeliest = min(alike or starts, key=lambda one: one.apart, default=None)
         if likeliest is None:
@@ -159,7 +149,7 @@ class Recording:
         usual = next((other.left for other, one in told if one is likeliest), 0.0)
         if fit is not None and alike and fit.left < HALF * usual:
             return replace(best, opens_alike=True)
-        return likeliest if alike else None
+        return likeliest
 
     def _starts(self, policy: Policy, apart: Array) -> list[Start]:
         """Return the likeliest starts, by the difference of the commands from each instant on."""
@@ -181,7 +171,7 @@ class Recording:
         k = round((start - self.first) * self.parts / self.dt)
         if not 0 <= k < len(self.whole.inputs):
             return np.inf
-        return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[0][k])
+        return float(instants_apart(self.whole, self.parts, policy, range(k, k + 1))[k])
 
     def on_step(self, policy: Policy, start: float) -> float:
         """Move a start by less than a step to where commands change."""
@@ -259,24 +249,22 @@ def _bridged(series: Series) -> Series:
 
 def instants_apart(
     log: Gridded, parts: int, policy: Policy, instants: Sequence[int] | None = None
-) -> tuple[Array, Array]:
-    """Return two measures for every instant, infinite where no run can begin, (N,) each.
+) -> Array:
+    """Return the mean difference of the commands from every instant on, (N,).
+
+    It is infinite where no run can begin: the log has to hold the complete run, or commands that
+    are constant before it, for runs that were cut or stopped.
 
     Args:
         log: states and inputs at N instants.
         parts: instants per step of the policy.
         policy: the policy for these states and inputs.
         instants: the indices to compute; None: all.
-
-    Returns:
-        The mean difference of the commands, if the log has the complete run or commands are
-        constant before it; and the share of the first commands that are not the policy's, for
-        runs that were cut or stopped.
     """
     sent, H = np.clip(log.inputs, policy.low, policy.high), policy.horizon
     changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
     count, quiet = np.cumsum(changed), round(QUIET_S / policy.dt * parts)
-    apart, strays = np.full((2, len(sent)), np.inf)
+    apart = np.full(len(sent), np.inf)
     least = least_of(H)
     asked = range(len(sent)) if instants is None else instants
     lasting = [(len(sent) - k - parts // 2 - 1) // parts + 1 for k in asked]
@@ -288,9 +276,7 @@ def instants_apart(
         begun = count[before] == count[np.maximum(ks - 1 - quiet, 0)]
         whole = (left >= H - LAST) | (begun & (left >= least))
         apart[ks[whole]] = ((off * known).sum(axis=1) / left)[whole]
-        # the mean tells those with as many strays apart
-        strays[ks] = (off[:, :least] > SLIGHT).mean(axis=1) + SLIGHT * off[:, :least].mean(axis=1)
-    return apart, strays
+    return apart
 
 
 def least_of(horizon: int) -> int:

@@ -31,9 +31,6 @@ def refuse_as_another(
 ) -> None:
     """Refuse a log that is stored as a run of another candidate, or as data.
 
-    The log of data was most likely passed by mistake, and a diagnosis may rest on it: only who
-    names a candidate is told to discard it.
-
     Args:
         workspace: the workspace with the search.
         path: the log.
@@ -41,22 +38,18 @@ def refuse_as_another(
         wanted: the requested candidate, "" for data, None for any run.
 
     Raises:
-        GroundedError: if it is stored as something else, with what to do instead.
+        GroundedError: if it is stored as something else.
     """
     ran = [one.trial.candidate for one in stored]
     if not ran or wanted in ran or (wanted is None and ran[-1]):
         return
-    identity = stored[-1].stored.id
-    if ran[-1]:
-        facts, then = {"wanted": wanted or "data"}, NextCommand("discard", (identity,))
-    else:
-        now = standing_in(workspace)
-        waits = now.outstanding.id if now.outstanding else ""
-        then = to_run(workspace, waits) if waits else NextCommand("status")
-        facts = {"waits": waits}
-        if wanted:
-            facts = {"wanted": wanted, "waits": waits or wanted, "both": "1"}
-    raise refused("log.stored", path, trial=identity, then=then, used=ran[-1] or "data", **facts)
+    now, identity = standing_in(workspace), stored[-1].stored.id
+    waits = now.outstanding.id if now.outstanding else ""
+    then = NextCommand("discard", (identity,))
+    if wanted is None and waits:  # the log of data was most likely passed by mistake
+        then = to_run(workspace, waits)
+    used = ran[-1] or "data"
+    raise refused("log.stored", path, trial=identity, used=used, waits=waits, then=then)
 
 
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
