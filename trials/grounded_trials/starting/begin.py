@@ -257,7 +257,7 @@ class _Draft:
         if not self.named:
             self.why += f"; inputs guessed, as by --inputs {','.join(self.model.inputs)}"
         left = [n for n in numbers if n not in {**self.model.states, **self.model.inputs}]
-        odd = [found("start.unused", *reversed(left))] * bool(left)
+        odd = [found("start.unused", *left)] * bool(left)
         if not set(self.model.inputs) & set(numbers):
             odd.append(found("given.no_input", "--inputs", what="command", weight=Weight.NOTE))
         gains = (one for name, one in self.model.params.items() if name.startswith("gain_"))
@@ -311,7 +311,7 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[Finding, ...]]:
 def _on_own(report: LogReport, guesses: Sequence[Guess], model: Model) -> Iterator[Finding]:
     """Yield what the user's own model and the log lack of each other."""
     used = {guess.path for guess in guesses}
-    left = [f.path for f in reversed(moving(report).values()) if f.path not in used]
+    left = [f.path for f in moving(report).values() if f.path not in used]
     if left := [path for path in left if not PARTS.search(path)]:
         more = [f"{len(left) - NAMED} more"] * (len(left) > NAMED)
         yield found("start.unused", *left[:NAMED], *more)

@@ -21,7 +21,7 @@ from grounded.units import factor_between
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
-from grounded_trials.logs.inspection.names import COMMAND_TOPIC, NAMES_BY_UNIT, PARTS
+from grounded_trials.logs.inspection.names import COMMAND_TOPIC, PARTS
 from grounded_trials.logs.inspection.relations import Signals
 from grounded_trials.logs.stated_units import Stated, bare_command, command_unit
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
@@ -38,15 +38,8 @@ COMMANDED = re.compile(
     "|comando"
 )
 SURGE = "u", {"x", "y", "psi", "r"}  # a name of an input, but beside these the speed ahead
-DONE = re.compile(r"\.(feedback|actual)\.")  # what a controller's joints did
-ACTUATOR = re.compile("servo|actuator")  # either a command or a measured position
-EFFORT = re.compile("force|thrust|power")  # an input if nothing else looks like one
-EFFORT_UNITS = NAMES_BY_UNIT.keys() - {"A"}  # a current in a log is mostly a measured one
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
-SENSED = re.compile(
-    "encoder|tick|position|current|effort|bumper|cliff|range|sonar|feedback|measured"
-)
 OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
 SPEEDS = ("v", "vel", "speed", "velocity", "linear", "lin_vel", "v_x", "vx")
 TURNS = ("w", "omega", "turn", "turn_rate", "yaw_rate", "angular", "ang_vel", "wz", "r")
@@ -65,21 +58,14 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
     """Return the numbers of a log that change, by their names in a generic model.
 
     Of several with one name, such as the x of a position and of a speed, the others are named after
-    their group, too: linear_x. What an IMU measures comes after all others, and its accelerations
-    are never named x, y, z.
+    their group, too: linear_x.
     """
-    topics = sorted(log.topics, key=lambda t: t.type.endswith("/Imu"))
-    fields = [one for t in topics for one in t.fields if one.low != one.high]
-    fields = [one for one in fields if not PARTS.search(one.path)]
     found: dict[str, FieldReport] = {}
-    for one in fields:
-        name, grouped = _word(one.path), _in_group(one.path)
-        name = grouped if grouped.startswith(("angular_", "linear_acceleration_")) else name
-        if name not in found:
-            found[name] = one
-        elif not (one.path.count("@") or grouped in found):
-            found[grouped] = one
-    return dict(reversed(found.items()))
+    for one in log.numbers:
+        if one.low != one.high and not PARTS.search(one.path):
+            name = _word(one.path)
+            found.setdefault(_in_group(one.path) if name in found else name, one)
+    return found
 
 
 def _noise_only(field: FieldReport) -> bool:
@@ -92,8 +78,7 @@ def _noise_only(field: FieldReport) -> bool:
 def called_input(name: str, path: str, beside: Collection[str]) -> bool:
     """Return whether more in a number's name, beside all names, speaks for a command than not."""
     speaks_for = bool(COMMANDED.search(path.lower())) + bool(SIDES.search(name))
-    surge = name == SURGE[0] and {*beside} >= SURGE[1]
-    return speaks_for > surge + 2 * bool(DONE.search(path))
+    return speaks_for > (name == SURGE[0] and {*beside} >= SURGE[1])
 
 
 def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
@@ -102,8 +87,7 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     A state whose rate is another state gets that as its derivative; every other state follows the
     inputs with a first-order lag, its own command alone if each input is the command of a state.
     Numbers of noise alone are no states. Without `inputs`, the inputs are the numbers that are
-    named like commands, else those held constant over several samples while others move, else
-    those named after an actuator, else forces, torques and voltages.
+    named like commands, else those held constant over several samples while others move.
 
     Args:
         clues: of the log.
@@ -118,19 +102,16 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
         if any(_word(one.path) == name for one in log.numbers):
             raise refused("start.still", name)
         raise unknown("number", name, found, "the log")
-    called = [*clues.sent][::-1]
+    called = [*clues.sent]
     followers = _followers(found, list(inputs) or called)
-    inputs = inputs or list(followers.values())[:MOST_STATES] or _inputs_in(found, called, unit)
+    guessed = list(followers.values())[:MOST_STATES] or (called or _held_in(found))[:MOST_INPUTS]
+    inputs = inputs or guessed or ["u"]
 
     # The states, and those whose rate is another one.
-    named = [name for name in reversed(found) if name not in inputs]
+    named = [name for name in found if name not in inputs]
     moved = [name for name in named if not _noise_only(found[name])]
     states = (moved or named)[:MOST_STATES] or ["x"]
     rates = _rates(log, {name: found[name].path for name in states if name in found})
-    for position, rate in rates.items():  # v is logged without a unit, x in m: v is in m/s
-        known_as = rate.removeprefix("s.")
-        if unit.get(known_as) == "1" != unit[position]:
-            unit[known_as] = f"{unit[position]}/s"
 
     # The equations of the others: each lags behind its own command, or behind all inputs.
     equations, lags, gains = [], dict[str, str](), dict[str, str]()
@@ -158,16 +139,10 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     )
 
 
-def _inputs_in(
-    found: Mapping[str, FieldReport], called: Sequence[str], unit: Mapping[str, str]
-) -> list[str]:
-    """Return the numbers that look like inputs: by their names, how they are held, their units."""
-    names = [*found][::-1]
-    held = [n for n in names if found[n].held > HELD]
-    held = held if 2 * len(held) < len(names) else []
-    driven = [n for n in names if ACTUATOR.search(n.lower())]
-    efforts = [n for n in names if EFFORT.search(n.lower()) or unit[n] in EFFORT_UNITS]
-    return (list(called) or held or driven or efforts)[:MOST_INPUTS] or ["u"]
+def _held_in(found: Mapping[str, FieldReport]) -> list[str]:
+    """Return the numbers that are held over several samples, if most are not."""
+    held = [name for name, one in found.items() if one.held > HELD]
+    return held if 2 * len(held) < len(found) else []
 
 
 def _turns(number: FieldReport) -> bool:
@@ -258,13 +233,8 @@ class Clues:
         paths = {*self.log.moving} if self.headed else set[str]()
         for left in sorted(paths):
             right = re.sub("left|Left|LEFT", lambda m: OTHER[m[0]], left)
-            if right == left or right not in paths or SENSED.search(left.lower()):
-                continue
-            names = _word(left), _word(right)
-            if names[0] != names[1]:
-                return names
-            if COMMANDED.search(left.lower()) or EFFORT.search(left.lower()):  # /left/thrust
-                return "left", "right"
+            if right != left and right in paths and _word(left) != _word(right):
+                return _word(left), _word(right)
         return ()
 
     @property
