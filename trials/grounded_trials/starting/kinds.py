@@ -21,7 +21,7 @@ from grounded.units import factor_between
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport
 from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
-from grounded_trials.logs.inspection.names import COMMAND_TOPIC, PARTS
+from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.inspection.relations import Signals
 from grounded_trials.logs.stated_units import Stated, bare_command, command_unit
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
@@ -34,23 +34,18 @@ SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition
 COMMANDED = re.compile(
     "cmd|command|desired|setpoint|target|input|throttle|torque|tau|effort|volt|pwm|duty|motor|steer"
     "|rudder|aileron|elevator|thruster"
-    r"|goal|control|\baction\b|\.reference\.|\.output\.|_con|_ref|stellgr|stellwert|sollwert|_soll\b|befehl|consigne|commande"
-    "|comando"
+    r"|goal|control|\baction\b|\.reference\.|\.output\.|_con|_ref"
 )
 SURGE = "u", {"x", "y", "psi", "r"}  # a name of an input, but beside these the speed ahead
 
 HEADING = re.compile(r"(^|[/._])(yaw|psi|heading|theta|th|orientation)([/._\d]|$)")
 OTHER = {"left": "right", "Left": "Right", "LEFT": "RIGHT"}
-SPEEDS = ("v", "vel", "speed", "velocity", "linear", "lin_vel", "v_x", "vx")
-TURNS = ("w", "omega", "turn", "turn_rate", "yaw_rate", "angular", "ang_vel", "wz", "r")
 AFLOAT = re.compile(r"thruster|propeller|(^|[/._])(usv|wamv|boat|vessel)([/._\d]|$)")
 FLYING = re.compile(
     r"(^|[/_])(cf\d*|crazyflie|quad(rotor|copter)?|drone|uav|mavros|copter)([/_]|$)"
 )
-LIFTED = "thrust(?!er)|attitude_setpoint|actuator_outputs"
-SPEED = re.compile(r"speed|veloc|(^|[/._])vel([/._]|$)|cmd_vel|linear|geschw|vitesse")
+SPEED = re.compile(r"speed|veloc|(^|[/._])vel([/._]|$)|cmd_vel|linear")
 MOTOR = re.compile("throttle|duty|pwm|motor|volt|current|power|effort|torque|(^|[/._])(gas|esc)")
-STEERS = re.compile("steer|servo|lenk")
 GAIN_RANGE = 5.0  # the gain's bounds are that many times smaller and larger
 
 
@@ -247,20 +242,6 @@ class Clues:
         return ", ".join((afloat[0].topic, *both)) if afloat and both else ""
 
     @property
-    def speed_and_turn(self) -> str:
-        """A speed command and a turn rate command beside a heading."""
-        sent = {bare_command(p).rpartition(".")[2].lower(): n for n, p in self.sent.items()}
-        pairs = [(sent[v], sent[w]) for v in SPEEDS for w in TURNS if {v, w} <= sent.keys()]
-        return ", ".join(pairs[0]) if pairs and self.headed else ""
-
-    @property
-    def angle_and_torque(self) -> str:
-        """The names of one joint."""
-        words = {_word(one.path).lower() for one in self.log.numbers}
-        angle, torque = words & {"theta", "angle", "q", "q_rad", "position"}, {"torque", "tau", "u"}
-        return ", ".join(sorted(words)) if angle and words & torque else ""
-
-    @property
     def flat(self) -> str:
         """Odometry of a robot that moves neither up nor sideways."""
         still = ("position.z", "linear.y", "linear.z")
@@ -279,11 +260,8 @@ EVIDENCE: tuple[tuple[str, Callable[[Clues], str]], ...] = (  # the first that a
     ("drone", lambda clues: clues.topic(FLYING)),
     ("boat", lambda clues: clues.afloat),
     ("car", lambda clues: clues.topic("steer", fields=True)),
-    ("drone", lambda clues: clues.topic(LIFTED, fields=True)),
     ("rover", lambda clues: clues.topic("cmd_vel", fields=True)),
     ("differential", lambda clues: ", ".join(clues.sides)),
-    ("rover", lambda clues: clues.speed_and_turn),
-    ("pendulum", lambda clues: clues.angle_and_torque),
     ("rover", lambda clues: clues.flat),
     ("generic", lambda clues: "--kind names another"),
 )
@@ -350,12 +328,7 @@ def pushed(plain: Skeleton, sent: Mapping[str, str], stated: Stated) -> Skeleton
     """
     if any(SPEED.search(path.lower()) for path in sent.values()):
         return plain
-    motors = {
-        name: path
-        for name, path in sent.items()
-        if MOTOR.search(path.lower()) and not STEERS.search(path.lower())
-    }
-    motors = {n: p for n, p in motors.items() if COMMAND_TOPIC.search(p.lower())} or motors
+    motors = {name: path for name, path in sent.items() if MOTOR.search(path.lower())}
     if len(motors) != 1:
         return plain
     ((name, path),) = motors.items()
