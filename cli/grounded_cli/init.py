@@ -117,7 +117,6 @@ def _tell(begun: Begun) -> None:
     show(field("model", what, "  "))
     show(field("grid", f"{begun.dt:g} s, {begun.horizon} steps", "  "))
     show(field("target", begun.target, "  "))
-    show(field("start", begun.start, "  "))
     both, known = (*begun.states, *begun.inputs), estimating(begun.states)
     aligned = partial(field, indent="  ", width=max(LABEL, *(len(guess.name) for guess in both)))
     heads = {len(begun.states): "inputs", 0: "states"}
@@ -140,4 +139,4 @@ def _tell(begun: Begun) -> None:
             show(aligned("", f"the smoother estimates it from {names} ([estimate])"))
     tell(begun.findings, all_=True)
     show(field("read", f"{begun.workspace}/model.py, {begun.workspace}/grounded.toml"))
-    show(next_line(begun.then, None if begun.again else begun.workspace))
+    show(next_line(begun.then, begun.workspace))

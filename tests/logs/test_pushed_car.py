@@ -29,11 +29,10 @@ def driven():
     return np.array(rows)
 
 
-def table(folder, *names, rows=None):
+def table(folder, *names):
     log = folder / "drive.csv"
     head = ",".join(("t", "v", "x", "y", "psi", *names))
-    rows = driven() if rows is None else rows
-    np.savetxt(log, rows, "%.5f", ",", header=head, comments="")
+    np.savetxt(log, driven(), "%.5f", ",", header=head, comments="")
     return log
 
 
@@ -48,14 +47,6 @@ def test_a_car_without_a_speed_command_is_driven_by_what_its_log_has(tmp_path, n
     assert gain.value == pytest.approx(FULL, rel=0.1)
     assert gain.unit == ("m/s" if unit == "1" else f"m/s/{unit}")
     assert gain.low < FULL / 2 and gain.high > 2 * FULL
-
-
-def test_a_throttle_held_while_the_motor_is_off_is_no_start(tmp_path):
-    """What [task] start holds is sent after a run, too."""
-    rows = driven()
-    rows[:50, 6] = 0.15
-    begin(tmp_path / "w", table(tmp_path, "steering", "throttle", rows=rows), kind="car")
-    assert not Workspace(tmp_path / "w").task.past.any()
 
 
 @pytest.mark.parametrize(("head", "unit"), [("steering [%]", "1"), ("steering [deg]", "rad")])

@@ -248,8 +248,8 @@ START: dict[str, Entry] = {
         "declare angles = {declared} in model.py",
     ),
     "interval": note(
-        "[[the log's commands change every {every:.3g} s; dt is {dt:.3g} s]][[, its rows come "
-        "every {rows:.3g} s]][[read as seconds, its rows are {apart:.3g} s apart]]",
+        "[[the log's commands change every {every:.3g} s; dt is {dt:.3g} s]][[read"
+        " as seconds, its rows are {apart:.3g} s apart]]",
         "[[every? [task] dt (--dt) sets another]][[apart? if the times are in ms or us, end that "
         "column's name with _ms or _us and create the workspace again in another folder]]",
     ),

@@ -33,7 +33,7 @@ from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
-from grounded_trials.starting.first_toml import held_first, write_first
+from grounded_trials.starting.first_toml import write_first
 from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import (
     KINDS,
@@ -82,11 +82,7 @@ class Begun(Document):
     states: tuple[Guess, ...] = field(metadata=UNSAID)
     inputs: tuple[Guess, ...] = field(metadata=UNSAID)
     target: str  # description of target.csv
-    start: str = field(metadata=UNSAID, default="")  # description of [task] start
     findings: tuple[Finding, ...] = ()
-    again: tuple[str, ...] = field(
-        metadata=UNSAID, default=()
-    )  # arguments of `init` once the log's time column is renamed
 
     @property
     def unsure(self) -> tuple[Guess, ...]:
@@ -95,12 +91,7 @@ class Begun(Document):
 
     @property
     def then(self) -> NextCommand:
-        """The next command: ingest the log as data, or inspect it if an input is missing.
-
-        It is `init` for another folder if the log's times seem to be in another unit.
-        """
-        if self.again:
-            return NextCommand("init", self.again)
+        """The next command: ingest the log as data, or inspect it if an input is missing."""
         whole = all(g.path for g in self.inputs) and any(g.path for g in self.states)
         return NextCommand("ingest", ("--data", self.log)) if whole else self.look
 
@@ -149,7 +140,7 @@ def begin(
         model: the user's model.py, or an MJCF or URDF file; it is copied together with the files
             that it reads from its folder. None: a skeleton is written.
         kind: kind of the skeleton, see `KINDS`; None: guessed from the log.
-        dt: control interval [s]; None: the interval at which commands change, see `interval_of`.
+        dt: control interval [s]; None: that of the commands in the log, see `interval_of`.
         inputs: names of the numbers that are inputs of a generic skeleton; empty: guessed.
         layout: the names and the rate of a table that does not say them; kept in [log].
         ask: called with each uncertain signal, returns the path to use; None: use the best guess.
@@ -164,10 +155,6 @@ def begin(
         raise refused("given.either", "--kind generic", "--inputs", how="first")
     own = own_model(model) if model is not None else None
     files = (FILE, "target.csv", *(own.missing(folder) if own else ("model.py",)))
-    options = {"--model": model, "--kind": kind, "--dt": dt, "--inputs": ",".join(inputs)}
-    options |= {"--columns": ",".join(layout.columns), "--rate": layout.rate}
-    given = [str(part) for key, value in options.items() if value for part in (key, value)]
-    again = (f"{folder}-2", "--from", str(log), *given)
     with fresh_folder(folder, files):
         # What the log has, and the model: the user's, or a skeleton of the kind of robot.
         logs, report, notes = _usable(log, layout)
@@ -182,20 +169,19 @@ def begin(
         slow = () if layout.rate or report.timed else _in_seconds(report)
 
         # The control interval, and the ranges: zero is sent after a run, so limits must include it.
-        step, note = (dt, ()) if dt else interval_of(report, commands, states)
+        step = dt or interval_of(report, commands, states)
         made = own.in_step(folder, drawn.model, step) if own else drawn.model
         ranges = {g.name: g.extent for g in (*states, *commands)}
-        for g in commands if drawn.kind != "drone" else ():
+        for g in commands:
             if (seen := ranges[g.name]) is not None:
                 ranges[g.name] = min(seen[0], 0.0), max(seen[1], 0.0)
 
         # The files: the target is read from the log as its [log] table says.
         table = mapping_toml(states, commands, simulated=report.simulated, layout=layout)
-        columns, sent, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
+        columns, sampled, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
         horizon = len(next(iter(columns.values()))) - 1
-        stood = held_first(made, columns, sent, step, ranges) or {}
         name, why = Path(log).name, drawn.why
-        write_first(folder, made, step, columns, horizon, ranges, table, why, name, stood)
+        write_first(folder, made, step, columns, horizon, ranges, table, why, name)
         more = [*_on_own(report, (*states, *commands), made)] if own else []
         return Begun(
             workspace=str(folder),
@@ -206,10 +192,8 @@ def begin(
             horizon=horizon,
             states=tuple(states),
             inputs=tuple(commands),
-            target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
-            start=", ".join(f"{n} = {value:.4g}" for n, value in stood.items()) or "empty",
-            findings=(*notes, *drawn.notes, *slow, *more, *note, *odd_run),
-            again=again if slow else (),
+            target=f"{horizon * step:.3g} s of the log" if sampled else "zeros",
+            findings=(*notes, *drawn.notes, *slow, *more, *odd_run),
         )
 
 
@@ -346,11 +330,11 @@ def _recorded(
     model: Model,
     states: Sequence[Guess],
     dt: float,
-) -> tuple[dict[str, Array], dict[str, Array], tuple[Finding, ...]]:
-    """Return the states (H + 1,) and inputs (H,) of a log's run, and what is odd about it.
+) -> tuple[dict[str, Array], bool, tuple[Finding, ...]]:
+    """Return the states (H + 1,) of a log's run, whether it has one, and what is odd about it.
 
-    The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again. One
-    that can't be sampled has no inputs, and a placeholder for a target.
+    The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again. For
+    one that can't be sampled a placeholder is returned.
     """
     from grounded_trials.workspace.intake.opening.foreign import rates_of  # slow
 
@@ -372,6 +356,5 @@ def _recorded(
         )
     except GroundedError as error:
         zeros = {model.state_names[0]: np.zeros(HORIZON + 1)}
-        return zeros, {}, (error.finding.weighing(Weight.NOTE),)
-    columns = dict(zip(measured, grid.states.T, strict=True))
-    return columns, dict(zip(mapping.inputs, grid.inputs.T, strict=True)), grid.findings
+        return zeros, False, (error.finding.weighing(Weight.NOTE),)
+    return dict(zip(measured, grid.states.T, strict=True)), True, grid.findings

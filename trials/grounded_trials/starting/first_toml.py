@@ -6,21 +6,13 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.trial import Trial
-from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
-from grounded_trials.workspace.candidates.at_rest import STOOD, Stand, standstill
 from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import FILE, OFFERED
 from grounded_trials.workspace.user_files.task_file import change_weight, write_target
-
-BEGAN = 0.1  # [s] at its start in which one may stand still that nothing has to hold
-
 
 TASK = """# {title}
 
@@ -84,7 +76,6 @@ def write_first(
     table: str,
     why: str,
     log: str,
-    held: Mapping[str, float],
 ) -> None:
     """Write grounded.toml and target.csv.
 
@@ -98,8 +89,6 @@ def write_first(
         table: the [log] table, as text.
         why: why this kind of robot was chosen.
         log: name of the log file.
-        held: states in which the robot stood at the start of the log, and the inputs that held it
-            there; may be {}.
     """
     write_target(folder / "target.csv", dt, dict(columns))
     weights = usual_weights(model, columns)
@@ -124,7 +113,7 @@ def write_first(
         model="",
         dt=number(dt),
         horizon=horizon,
-        start=inline({name: _rounded(value) for name, value in held.items()}),
+        start="{ }",
         feedback="true",
         latency=inline({name: _rounded(value) for name, value in late.items()}),
         weights=WEIGHTS.format(state=state, terminal=terminal, changes=change),
@@ -133,51 +122,6 @@ def write_first(
         rest=table.rstrip(),
     )
     write_atomically(folder / FILE, text.encode())
-
-
-def held_first(
-    model: Model,
-    columns: Mapping[str, Array],
-    sent: Mapping[str, Array],
-    dt: float,
-    ranges: Mapping[str, tuple[float, float] | None],
-) -> dict[str, float] | None:
-    """Return the states in which a robot stands at the start of a log, and the inputs holding it.
-
-    States at 0 are not named, nor inputs that need not hold it: these then count as 0 before a run,
-    which is also what is sent after it. Without any it may stand for a moment only (`BEGAN`); and
-    one that drives in a plane may start anywhere, so that no state is named. Returns None if the
-    robot moves or an input changes, and for a model without a speed, whose drift could be slow.
-
-    Args:
-        model: the model of the states and inputs.
-        columns: states, by name (H + 1,).
-        sent: inputs, by name (H,).
-        dt: control interval [s].
-        ranges: lowest and highest value of each signal in the whole log.
-    """
-    speeds = any(unit.endswith("/s") for unit in model.states.values())
-    whole = set(sent) == set(model.inputs) and set(columns) == set(model.states)
-    if not speeds or not whole:
-        return None
-    x, u = (
-        np.column_stack([one[name] for name in names])
-        for one, names in ((columns, model.state_names), (sent, model.input_names))
-    )
-    trial = Trial(x, u, dt, model.state_names, model.input_names)
-    long, brief = (standstill(model, trial, seconds, ranges) for seconds in (STOOD, BEGAN))
-    stand = long or brief
-    if stand is None or (long is None and stand.needs.any()):
-        return None
-    each = zip(model.input_names, stand.inputs.tolist(), stand.needs, strict=True)
-    held = {name: u for name, u, needed in each if needed}
-    return _away(model, stand) | held if held or not has_plane(model) else None
-
-
-def _away(model: Model, stand: Stand) -> dict[str, float]:
-    """Return the states that are no speeds where a robot stands, except for those near 0."""
-    each = zip(model.states.items(), stand.states.tolist(), stand.steady, strict=True)
-    return {n: at for (n, unit), at, near in each if not unit.endswith("/s") and abs(at) > near}
 
 
 def _span(ends: Sequence[float]) -> str:

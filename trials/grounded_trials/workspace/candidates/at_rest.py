@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -35,7 +34,7 @@ from grounded_trials.workspace.user_files.task_file import SMALLEST_RANGE
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-STOOD = 0.5  # [s] at the start of a log in which the robot may stand still
+STOOD = 0.5  # [s] at the start of a trial in which the robot may stand still
 LEAST_STEPS = 3  # of it
 STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts as standing still
 
@@ -60,21 +59,14 @@ class Stand:
     trial: str
 
 
-def standstill(
-    model: Model,
-    trial: Trial,
-    seconds: float = STOOD,
-    ranges: Mapping[str, tuple[float, float] | None] = MappingProxyType({}),
-) -> Stand | None:
+def standstill(model: Model, trial: Trial) -> Stand | None:
     """Return where the robot stands at the start of a trial; None if it moves there.
 
     Args:
         model: whose states they are.
         trial: it may be the first part of a log.
-        seconds: how long it has to stand.
-        ranges: lowest and highest value of each signal in the whole log; else those of the trial.
     """
-    steps = max(LEAST_STEPS, round(seconds / trial.dt))
+    steps = max(LEAST_STEPS, round(STOOD / trial.dt))
     x, u = trial.states[: steps + 1], trial.inputs[:steps]
     if trial.steps <= steps or not (np.isfinite(x).all() and np.isfinite(u).all()):
         return None
@@ -82,8 +74,6 @@ def standstill(
         np.nan_to_num(np.concatenate([end(v, axis=0) for v in (trial.states, trial.inputs)]))
         for end in (np.fmin.reduce, np.fmax.reduce)
     )
-    for i, name in enumerate((*model.state_names, *model.input_names)):
-        low[i], high[i] = ranges.get(name) or (low[i], high[i])
     whole, sent, n = (high - low)[: model.n], (high - low)[model.n :], model.n
     rates = np.array([unit.endswith("/s") for unit in model.states.values()])
     off, later = drift(x), u[steps // 2 :]
