@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,9 +14,6 @@ from grounded.frozen import Array, white_noise
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
-
-if TYPE_CHECKING:
-    from grounded.search.difference import Starts
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
@@ -36,8 +33,6 @@ Slopes = Literal[
 DOUBTFUL_GAIN = 0.1
 IMPROVED = 0.95  # probability of an improvement from which it counts as one
 UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their cost
-# share of a gain or loss due to different start states from which on it is reported
-START_SHARE = 0.3
 UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 
@@ -172,8 +167,7 @@ class Tried(Result):
     trials: tuple[Trial, ...]
     utilities: tuple[float, ...]
     accepted: bool | None  # None: undecided, trials are missing
-    in_doubt: bool = False  # undecided because one of the two is to be run again
-    to_settle: str = ""  # id of the candidate whose next run is to settle the doubt
+    in_doubt: bool = False  # undecided because the best one is to be run again
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
     noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `known_noise`
@@ -182,7 +176,6 @@ class Tried(Result):
     unsure: bool = False  # runs may differ by as much as it gained (`Difference.sure`)
     gone: tuple[str, ...] = ()  # trials that it was made from and that were discarded since
     asked: bool = False  # whether its last trial is to be discarded, unless the user goes on
-    starts: Starts | None = None  # what the start states of its runs cost, by the model
 
     @cached_property
     def utility(self) -> float:
@@ -190,20 +183,8 @@ class Tried(Result):
         return float(np.mean(self.utilities)) if self.utilities else float("nan")
 
     def gain_over(self, other: Tried) -> float:
-        """Return by how much its mean utility exceeds another's; every judgement uses this number.
-
-        A loss is counted without the part that different start states explain by the model. A gain
-        counts as measured, as in the paper, and so does a loss of which they explain little.
-        """
-        return self.utility - other.utility + self.excused(other)
-
-    def excused(self, other: Tried) -> float:
-        """Return the part of a loss to another candidate that the start states explain, or 0."""
-        loss = other.utility - self.utility
-        if self.starts is None or not (loss >= 0 and np.isfinite(loss)):
-            return 0.0
-        due = -self.starts.owed(self, other)
-        return due if due > START_SHARE * loss else 0.0
+        """Return by how much its mean utility exceeds another's."""
+        return self.utility - other.utility
 
     @property
     def promised(self) -> float:

@@ -1,10 +1,9 @@
 """Difference: is one candidate better than another, by how much, and how sure is that?
 
 Every part that compares two utilities asks it: the verdicts and the end of the search, `status`,
-`propose`, the report and the page. Single runs scatter, and they begin at different start states,
-whose part of a difference the planning model tells (`Starts`). Student's t-test with the scatter of
-all repeats of similar utility gives the probability. While nothing was repeated, costs are taken to
-scatter as chi-squared with eight degrees of freedom.
+`propose`, the report and the page. Student's t-test with the scatter of all repeats of similar
+utility gives the probability. While nothing was repeated, costs are taken to scatter as chi-squared
+with eight degrees of freedom.
 
 Two runs may have nearly equal utilities by chance, and few candidates are run more than twice. So
 the variance of a run is estimated from pooled data (`Repeats`):
@@ -37,14 +36,8 @@ from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.places import true_values
 from grounded.policy import Policy
-from grounded.search.candidate import DOUBTFUL_GAIN, IMPROVED, START_SHARE, Candidate, Tried
-from grounded.search.noise import (
-    beyond_noise,
-    known_noise,
-    noise_cost,
-    noise_missed,
-    sensor_noise,
-)
+from grounded.search.candidate import DOUBTFUL_GAIN, IMPROVED, Candidate, Tried
+from grounded.search.noise import known_noise, noise_cost, noise_missed, sensor_noise
 from grounded.search.planner import Planner, predicted
 from grounded.task import Task
 from grounded.trial import Trial, scattered
@@ -117,58 +110,7 @@ def _sums(tried: Tried) -> Array:
     return np.array([tried.utility, len(tried.utilities) - 1.0, total, *parts])
 
 
-# --- what start states cost -----------------------------------------------------------------------
-
-
-class Starts:
-    """What the starts of runs cost by the planning model, each run predicted only once.
-
-    A run that began off s_0 has another utility than its policy has from s_0. The model runs the
-    policy from both; the difference is what the start cost.
-
-    Args:
-        planner: has the model that predicts the runs.
-    """
-
-    def __init__(self, planner: Planner) -> None:
-        self.planner, self._known = planner, dict[tuple[str, int], float]()
-
-    def owed(self, one: Tried, other: Tried) -> float:
-        """Return the part of the difference of two mean utilities that is due to the starts.
-
-        It is 0 if all runs began alike, whatever their common start costs, and NaN if the model
-        can't tell it.
-        """
-        starts = np.array([t.began for tried in (one, other) for t in tried.trials])
-        middle, model = starts.mean(axis=0), self.planner.task.model
-        with np.errstate(all="ignore"):  # of diverged runs
-            apart = any(
-                beyond_noise(
-                    (trial,),
-                    model.difference(trial.began, middle)[None],
-                    tried.candidate.predicted_states[0],
-                    tried.candidate.predicted_states,
-                ).any()
-                for tried in (one, other)
-                for trial in tried.trials
-            )
-        return self.cost(other) - self.cost(one) if apart else 0.0
-
-    def cost(self, tried: Tried) -> float:
-        """Return what the starts of a candidate's runs cost on average; < 0 for lucky ones.
-
-        It is NaN if a run fails in the model, or if a start would cost more than the whole run did.
-        """
-        return float(np.mean([self._of(tried, k) for k in range(len(tried.trials))]))
-
-    def _of(self, tried: Tried, k: int) -> float:
-        key = (tried.candidate.id, k)
-        if key not in self._known:
-            task, began = self.planner.task, tried.trials[k].began
-            off = task.model.difference(began, task.start)
-            self._known[key] = -worth_of_start(self.planner, tried.candidate.policy, off)
-        cost = self._known[key]
-        return cost if math.isfinite(cost) and cost <= -tried.utilities[k] else math.nan
+# --- what a start state costs ---------------------------------------------------------------------
 
 
 def worth_of_start(planner: Planner, policy: Policy, off: Array) -> float:
@@ -188,19 +130,6 @@ def worth_of_start(planner: Planner, policy: Policy, off: Array) -> float:
             for start in (moved, problem.start)
         )
     return float(from_there - from_s_0)
-
-
-def missed_by_start(tried: Tried) -> float:
-    """Return what the starts of a candidate's runs cost by the model; 0 if that is a small part.
-
-    A part of what they missed its prediction by, which begins at [task] start. 0 if the model can't
-    tell it, too.
-    """
-    if tried.starts is None or not tried.trials or not math.isfinite(tried.utility):
-        return 0.0
-    cost = tried.starts.cost(tried)
-    small = abs(cost) < START_SHARE * abs(tried.promised - tried.utility)
-    return 0.0 if small or not math.isfinite(cost) else cost
 
 
 # --- the comparison -------------------------------------------------------------------------------
@@ -226,11 +155,6 @@ class Difference:
     def gain(self) -> float:
         """By how much the mean utility of `after` exceeds that of `before`, as measured."""
         return self.after.utility - self.before.utility
-
-    @property
-    def own(self) -> float:
-        """The part of the gain that is not due to different start states."""
-        return self.gain - self.owed
 
     @property
     def known(self) -> bool:
@@ -281,25 +205,13 @@ class Difference:
         return math.sqrt(runs * near.variance) if near.freedom else 0.5 * cost * math.sqrt(runs)
 
     @cached_property
-    def of_start(self) -> float:
-        """The part of the gain that is due to the start by the planning model; NaN if unknown."""
-        starts = self.after.starts
-        return 0.0 if starts is None else starts.owed(self.after, self.before)
-
-    @property
-    def owed(self) -> float:
-        """How much of the gain is due to different start states; 0 if it is a small part."""
-        start = self.of_start
-        return start if abs(start) > START_SHARE * abs(self.gain) and math.isfinite(start) else 0.0
-
-    @cached_property
     def probability(self) -> float:
-        """That the later one is better, start states apart; NaN if repeats or models can't tell."""
+        """That the later one is better; NaN if repeats can't tell."""
         if not math.isfinite(self.before.utility):  # it failed
             return 1.0
-        if not self.known or (self.error and math.isnan(self.of_start)):
+        if not self.known:
             return math.nan
-        return student(self.own / self.error, self.freedom) if self.error else float(self.own > 0)
+        return student(self.gain / self.error, self.freedom) if self.error else float(self.gain > 0)
 
     @property
     def sure(self) -> bool:
@@ -309,7 +221,7 @@ class Difference:
         """
         sure = self.probability
         if math.isnan(sure):
-            return self.before.utility < COST_RATIO * (self.after.utility - self.owed)
+            return self.before.utility < COST_RATIO * self.after.utility
         return sure >= IMPROVED
 
     @property
@@ -326,24 +238,19 @@ class Difference:
             share=abs(self.gain) / cost,
             better=int(self.gain > 0),
             error=self.error / cost,
-            start=abs(self.owed) / cost,
         )
 
     def to_finding(self) -> Finding:
         """Return the gain with how certain it is. It asks for no run: that is decided elsewhere."""
-        told = self.known and not self.owed and not math.isnan(self.of_start) and self.error > 0
         return found(
             "search.gain",
             self.after.candidate.id,
             after=self.after.candidate.id,
             before=self.before.candidate.id,
             gain=Quantity(self.gain, "1", self.error),
-            probability=self.probability if told else None,
-            start=self.owed or None,
-            own=self.own,
-            apart=int(math.isnan(self.of_start) and self.error > 0),
-            single=int(not self.known and not self.owed),
-            exact=int(self.known and self.error == 0 and not self.owed),
+            probability=self.probability if self.error > 0 else None,
+            single=int(not self.known),
+            exact=int(self.known and self.error == 0),
         )
 
 
@@ -404,13 +311,10 @@ def judged(
     trials: Sequence[Trial],
     options: SearchOptions,
     model: str,
-    starts: Starts | None = None,
 ) -> tuple[tuple[Tried, ...], Tried | None, int]:
     """Return every candidate with its trials and verdict, the incumbent, and the iterations.
 
-    A candidate is accepted by measured utilities alone, as in the paper: a model that is told the
-    start by one noisy sample was wrong by half of what it explained. A loss that different start
-    states explain is in doubt.
+    A candidate is accepted by measured utilities alone, as in the paper.
     """
     history: list[Tried] = []
     incumbent: Tried | None = None
@@ -434,7 +338,7 @@ def judged(
             history.append(Tried(candidate, own, utilities, None, gone=gone))
             continue
         pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
-        tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone, starts=starts)
+        tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone)
         better = incumbent is None or tried.utility > incumbent.utility
         if better and not failed:
             tried = replace(tried, accepted=True)
@@ -442,23 +346,16 @@ def judged(
             incumbent, losses = tried, 0
             # a loss that was in doubt is one: this candidate beat both runs
             history = [
-                replace(t, accepted=False, in_doubt=False, to_settle="") if t.in_doubt else t
-                for t in history
+                replace(t, accepted=False, in_doubt=False) if t.in_doubt else t for t in history
             ]
         elif incumbent is not None and (candidate.base, candidate.model) == (
             incumbent.candidate.id,
             model,
         ):
             losses += 1
-            most, once = losses + options.repeats, options.repeats + 1
-            if (
-                options.rerun_incumbent
-                and not (spent or exact)
-                and in_doubt(incumbent, tried, history, most, once)
-            ):
-                again = to_settle(incumbent, tried, most, once)
-                name = again.candidate.id if again else ""
-                tried = replace(tried, accepted=None, in_doubt=True, to_settle=name)
+            doubts = options.rerun_incumbent and not (spent or exact)
+            if doubts and in_doubt(incumbent, tried, history, losses + options.repeats):
+                tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     told = _told(task, history, trials)
     best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
@@ -495,33 +392,15 @@ def repeated_exactly(trials: Sequence[Trial]) -> bool:
     return any(a.repeats(b) for a, b in pairwise(trials))
 
 
-def in_doubt(
-    incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int, once: int = 2
-) -> bool:
-    """Return whether a loss may be due to a lucky trial of the incumbent, or to other start states.
+def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int) -> bool:
+    """Return whether a loss may be due to a lucky trial of the incumbent.
 
-    What different start states explain of it (`Tried.excused`) is no loss. A lucky incumbent would
-    block every further step. So after a loss within two standard errors the incumbent is run again,
-    until it has `most` trials: one for each loss; a loser whose starts explain it is, until it has
-    `once`. Without repeats at a similar utility a loss of more than 1.4 times the best cost is
-    accepted at once (`Difference.likely_error`). On a deterministic system this costs one trial per
-    incumbent.
+    A lucky incumbent would block every further step. So after a loss within two standard errors it
+    is run again, until it has `most` trials: one for each loss. Without repeats at a similar
+    utility a loss of more than 1.4 times the best cost is accepted at once
+    (`Difference.likely_error`). On a deterministic system this costs one trial per incumbent.
     """
-    if not np.isfinite(loser.utility) or to_settle(incumbent, loser, most, once) is None:
+    if not np.isfinite(loser.utility) or len(incumbent.trials) >= most:
         return False
     lead = Difference(loser, incumbent, (*history, loser))
-    return not -loser.gain_over(incumbent) > LUCK * lead.likely_error
-
-
-def to_settle(incumbent: Tried, loser: Tried, most: int, once: int = 2) -> Tried | None:
-    """Return which of two candidates to run again after a loss; None if that was done enough.
-
-    It is the incumbent, which may have been lucky, but the one whose starts matter more if start
-    states explain the loss. An incumbent is not run again that has `most` trials, nor a loser that
-    has `once`: where a robot can't be placed more exactly, a further run begins no nearer.
-    """
-    either = [(incumbent, most)]
-    if loser.starts is not None and loser.excused(incumbent):
-        either, cost = [(loser, min(once, most)), (incumbent, most)], loser.starts.cost
-        either.sort(key=lambda one: -abs(cost(one[0])))
-    return next((one for one, runs in either if len(one.trials) < runs), None)
+    return not lead.gain > LUCK * lead.likely_error

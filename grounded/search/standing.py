@@ -6,8 +6,7 @@ order of their proposal, and their trials determine:
     the incumbent    the best candidate so far, pi_theta^(i); its trials measure the next bias
     outstanding      the candidate that was proposed and has not been run often enough
     tried            the steps from the incumbent that did not improve (step 6)
-    in doubt         a loss that may be luck: the incumbent is run again before it is accepted; or
-                     that other start states explain, by the model: that run is repeated
+    in doubt         a loss that may be luck: the incumbent is run again before it is accepted
 
 Two trials of a candidate that agree to the last bit show that the system is deterministic, unless
 other repeats differ: from then on nothing is run twice.
@@ -30,7 +29,7 @@ from grounded.figures.figure import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
-from grounded.search.difference import LUCK, Difference, Starts, judged, last_gain, missed_by_start
+from grounded.search.difference import LUCK, Difference, judged, last_gain
 from grounded.search.pictures import search_figure
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
@@ -269,13 +268,12 @@ def standing(
         trials: in order of storage; those of unknown candidates are ignored.
         options: the [search] table.
         model: fingerprint of the current planning model; a direction belongs to one model.
-        planner: has that model, which tells what start states cost; None: that stays unknown.
+        planner: remembers what was found; None: it is found again.
     """
     of = [task, options, model, *candidates, *trials]
     memory = planner.memory if planner else {}
     if not _same(memory.get("of", ()), of):
-        starts = Starts(planner) if planner else None
-        memory.update(of=of, found=judged(task, candidates, trials, options, model, starts))
+        memory.update(of=of, found=judged(task, candidates, trials, options, model))
     history, incumbent, iteration = memory["found"]
     total = sum(len(t.trials) for t in history)
     now = Standing(
@@ -394,7 +392,7 @@ def let_down(now: Standing, model: str) -> Standing:
         # a plan may replay a log's noise
         noise = max(LUCK * between.error if between.known else 0.0, tried.noise_cost)
         if made.of_model_alone and made.model == model:
-            short = gain = tried.promised - best.utility - missed_by_start(best)
+            short = gain = tried.promised - best.utility
         elif made in lost and not made.doubtful:
             loss, gain = -tried.gain_over(best), made.predicted_gain
             short = min(loss + gain, max(loss, gain))
@@ -417,7 +415,7 @@ def let_down(now: Standing, model: str) -> Standing:
             by=gain,
         )
         return now.with_finding(reached)
-    return now.with_finding(_far_off(most, most.promised - missed_by_start(most)))
+    return now.with_finding(_far_off(most, most.promised))
 
 
 def _far_off(tried: Tried, promised: float) -> Finding:
@@ -463,8 +461,7 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     doubt = next((t for t in now.history if t.in_doubt), None)
     if doubt is not None and now.incumbent is not None:
         best, missing = now.incumbent.candidate, 1
-        made = doubt.candidate if doubt.to_settle == doubt.candidate.id else best
-        why = _in_doubt(now, doubt, now.incumbent, made)
+        made, why = best, _in_doubt(doubt, now.incumbent)
     elif waiting is not None:
         made, missing = waiting.candidate, options.repeats - len(waiting.trials)
         why = found("search.waiting", made.id, candidate=made.id, missing=missing)
@@ -473,27 +470,16 @@ def _awaited(now: Standing, options: SearchOptions, model: str) -> Standing | No
     return replace(now, phase=Phase.AWAIT, outstanding=made, missing=missing, findings=(why,))
 
 
-def _in_doubt(now: Standing, doubt: Tried, best: Tried, made: Candidate) -> Finding:
-    """Return why a loss is in doubt, what is at stake in another run, and how to stop.
-
-    Args:
-        now: the standing.
-        doubt: the candidate that lost.
-        best: the best one.
-        made: the one of the two that is run again.
-    """
-    excused = doubt.excused(best)
+def _in_doubt(doubt: Tried, best: Tried) -> Finding:
+    """Return why a loss to the best one is in doubt, what another run may gain, and how to stop."""
     share = max(doubt.candidate.promised_over(best), 0.0) / max(abs(best.utility), 1e-300)
-    known = not excused and math.isfinite(best.deviation)
     return found(
         "search.in_doubt",
-        made.id,
-        candidate=made.id,
+        best.candidate.id,
+        candidate=best.candidate.id,
         loser=doubt.candidate.id,
         best=best.candidate.id,
-        loss=best.utility - doubt.utility if excused else None,
-        start=excused or None,
-        known=int(known),
+        known=int(math.isfinite(best.deviation)),
         share=None if share >= DOUBTFUL_GAIN or best.is_unsteady else max(share, 1e-9),
     )
 

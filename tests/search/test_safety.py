@@ -34,7 +34,6 @@ from grounded.search.step_size import (
     Step,
     after_failure,
     after_success,
-    losers_of,
 )
 from grounded.solve import ddp
 from grounded.trial import Trial
@@ -303,19 +302,6 @@ class Story:
 @pytest.fixture
 def story():
     return Story()
-
-
-def test_a_better_candidate_that_began_off_is_run_again_and_becomes_the_best(story):
-    now = story.run(1, OFF)
-    best, doubt = now.history
-    assert doubt.utility < best.utility and doubt.gain_over(best) > 0
-    assert (doubt.verdict(), doubt.to_settle) == ("in doubt", "c0002")
-    assert (now.phase, now.outstanding.id, now.missing) == ("await-trial", "c0002", 1)
-    assert losers_of(now.history, "c0001", PLANNER.fingerprint) == []
-    now = story.run(0, OFF)  # what the best one measures then is no better
-    now = story.run(1)
-    assert now.incumbent.candidate.id == "c0002" and now.phase == "propose"
-    assert now.incumbent.utility > now.history[0].utility
 
 
 def test_a_start_behind_a_late_sensor_costs_as_much(story):

@@ -160,10 +160,9 @@ SEARCH: dict[str, Entry] = {
     # it waits
     "waiting": note("{candidate} is waiting for {missing:trial}"),
     "in_doubt": note(
-        "{loser} lost to {best}[[ by {loss}]][[, but by the model {start} of that is due to where "
-        "the runs began]][[known? by no more than noise may explain]]: {candidate} is waiting for "
-        "another trial[[. {loser} promises {share:%} of what {best} costs: if that is not worth a "
-        "run, stop with {best} (`export best`)]]",
+        "{loser} lost to {best}[[known? by no more than noise may explain]]: {candidate} is "
+        "waiting for another trial[[. {loser} promises {share:%} of what {best} costs: if that is "
+        "not worth a run, stop with {best} (`export best`)]]",
     ),
     "discard_first": note("discard {trial}, a run of {candidate}, or go on with it: `propose`"),
     "to_robot": note(
@@ -242,15 +241,10 @@ SEARCH: dict[str, Entry] = {
     "gain": note(
         "the last gain in utility, of {after} over {before}, is {gain}[[, an improvement with "
         "probability {probability:.2f}]][[exact? ; repeated trials agree exactly]][[single? ; "
-        "runs of similar utility were not repeated, so their noise is unknown]][[; by the model "
-        "{start:.3g} of it is due to where their runs began, and {own:.3g} to the "
-        "policy]][[apart? , but their runs began apart, and what that is worth is not known]]",
+        "runs of similar utility were not repeated, so their noise is unknown]]",
     ),
     "better": note(
-        "{share:%} {better:1=better,0=worse} than the model's own policy[[, +- {error:%}]][[; by "
-        "the model, different start states alone changed the cost by {start:%}]]",
+        "{share:%} {better:1=better,0=worse} than the model's own policy[[, +- {error:%}]]",
     ),
-    "lead": note(
-        "the scatter of runs, or where they began, may explain its lead on the model's own policy"
-    ),
+    "lead": note("the scatter of runs may explain its lead on the model's own policy"),
 }

@@ -15,7 +15,6 @@ import numpy as np
 from grounded.findings import Finding, Quantity, found
 from grounded.findings.finding import Fact
 from grounded.search.candidate import Candidate, Tried
-from grounded.search.difference import missed_by_start
 from grounded.search.step_size import Step
 from grounded.task import Task
 from grounded_trials.workspace.off_target import roles_of, tracked
@@ -161,7 +160,7 @@ def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) 
     the robot does (`replayed`).
     """
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
-    missed = [abs(one.promised - missed_by_start(one) - one.utility) for one in last]
+    missed = [abs(one.promised - one.utility) for one in last]
     whole = tuple(f"{off:.2g}" for off in missed if math.isfinite(off))
     best, once = now.incumbent, len(missed) == 1
     facts: dict[str, Fact | None] = {
