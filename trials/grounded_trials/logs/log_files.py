@@ -25,7 +25,6 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
 from grounded_trials.logs.log_paths import empty, log_files, on_disk, open_log
 from grounded_trials.plain_file import unreadable
-from grounded_trials.store.own_files import format_in, format_of
 from grounded_trials.within import within
 
 P = ParamSpec("P")
@@ -203,19 +202,3 @@ def _digest(files: tuple[Path, ...]) -> str:
             for name, column in {"": record.times, **record.columns}.items():
                 hasher.update(name.encode() + column.tobytes())
     return hasher.hexdigest()
-
-
-def kind_of(path: Path) -> str:
-    """Return the `format` of a file written by grounded, compressed or not, see `format_of`."""
-    if kind := format_of(path):
-        return kind
-    try:
-        with open_log(path) as stream:
-            packed = stream.read(len(_ZSTD)) == _ZSTD
-        return read_apart(path, _packed_format) if packed else ""
-    except GroundedError:
-        return ""
-
-
-def _packed_format(files: tuple[Path, ...]) -> str:
-    return format_in(log_records(files[0]))

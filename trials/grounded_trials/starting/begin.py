@@ -29,7 +29,6 @@ from grounded_trials.logs.inspection.guess import Guess, mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
 from grounded_trials.logs.inspection.joint_names import joint_names
 from grounded_trials.logs.inspection.names import PARTS
-from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
@@ -45,6 +44,7 @@ from grounded_trials.starting.kinds import (
 )
 from grounded_trials.starting.own_model import OwnModel, own_model
 from grounded_trials.starting.skeletons import Skeleton
+from grounded_trials.store.own_files import format_of
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table
 from grounded_trials.workspace.user_files.config import FILE
@@ -267,7 +267,7 @@ def _usable(
 ) -> tuple[tuple[Path, ...], LogReport, tuple[Finding, ...]]:
     """Return the files of a log, what is in it, and notes; refuse one that tells no motion."""
     files = log_files(log)
-    if kind_of(files[0]):
+    if format_of(files[0]):
         raise refused("start.no_start", log, why="own")
     report = inspect_log(log, layout)
     if report.damage:

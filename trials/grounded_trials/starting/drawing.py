@@ -19,7 +19,6 @@ from grounded.model import Model
 from grounded.places import velocities
 from grounded.result import UNSAID, Document
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import kind_of
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, read_log
 from grounded_trials.starting.shapes import (
@@ -32,7 +31,7 @@ from grounded_trials.starting.shapes import (
     path_target,
     step_target,
 )
-from grounded_trials.store.own_files import TRIAL
+from grounded_trials.store.own_files import TRIAL, format_of
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.wording import figure
 from grounded_trials.workspace.candidates.at_rest import (
@@ -68,7 +67,7 @@ def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[st
         path = stored.get(file.lower(), path)
     if not path.exists():
         raise unknown("file or shape", file, shapes)
-    if path.is_file() and kind_of(path) == TRIAL:
+    if path.is_file() and format_of(path) == TRIAL:
         trial, _, _ = read_trial(path)
         trial = trial.until(max(trial.finite_steps, 0))
         times = trial.dt * np.arange(trial.steps + 1.0)

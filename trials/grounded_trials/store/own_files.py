@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -27,7 +27,6 @@ from grounded_trials.formats.mcap_records import (
     End,
     Messages,
     Metadata,
-    Record,
     Schema,
 )
 from grounded_trials.formats.mcap_walk import (
@@ -181,20 +180,14 @@ def format_of(path: Path) -> str:
     """
     try:
         with open_file(path) as stream:
-            if stream.read(len(MAGIC)) == MAGIC:
-                return format_in(read_records(mapped(stream), str(path), packed=False))
+            mcap = stream.read(len(MAGIC)) == MAGIC
+            for record in read_records(mapped(stream), str(path), packed=False) if mcap else ():
+                if isinstance(record, Metadata) and record.name == "grounded":
+                    return record.data.get("format", "")
+                if isinstance(record, Messages):
+                    break
     except (OSError, GroundedError):
         pass
-    return ""
-
-
-def format_in(records: Iterable[Record]) -> str:
-    """Return the `format` stated before the first messages among some records, or ""."""
-    for record in records:
-        if isinstance(record, Metadata) and record.name == "grounded":
-            return record.data.get("format", "")
-        if isinstance(record, Messages):
-            break
     return ""
 
 

@@ -18,7 +18,7 @@ from grounded.findings import Finding, Quantity, Weight, found
 from grounded_trials.formats.bad import Bad, BadPath
 from grounded_trials.formats.mcap_records import About, Header, Messages, Metadata, Rows
 from grounded_trials.formats.mcap_walk import DamagedFile, Part, Topic, by_topic
-from grounded_trials.formats.message_path import WORLD, MessagePath, is_topic, parse_path
+from grounded_trials.formats.message_path import MessagePath, is_topic, parse_path
 from grounded_trials.formats.messages import (
     Decoded,
     Decoder,
@@ -42,8 +42,6 @@ NAMING = {  # types of messages that name joints, and their field
 NOISE_SAMPLES = 10  # samples of a batch needed to estimate the noise
 DECODED = 20_000  # decoded messages of a topic beyond which messages are skipped
 GAP = 10.0  # intervals; longer gaps are reported
-REPEATS = 0.1  # share of samples like the one before, from which a sensor may come in steps
-STEP = 1 / 3  # of a sensor's step: its standard deviation, a little more than 1 / sqrt(12)
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class FieldReport:
     low: float | None  # smallest and largest finite value; None if there is none
     high: float | None
     not_finite: int
-    noise: float = 0.0  # standard deviation of the white noise; at least a third of its steps
+    noise: float = 0.0  # standard deviation of the white noise
     held: float = 0.0  # share of nonzero samples that repeat the one before
 
 
@@ -292,7 +290,7 @@ class _Topic:
             last_s=float(t.max() - start) * 1e-9 if len(t) else None,
             stamped=skews is not None,
             skew_s=None if skews is None else float(np.median(skews)) * 1e-9,
-            fields=tuple(_telling(fields)),
+            fields=tuple(fields),
             problem=self.problem,
         )
 
@@ -302,13 +300,6 @@ def _joints_in(part: Decoded, decoder: Decoder) -> set[tuple[str, ...]]:
     listed = next((field for name, field in NAMING.items() if decoder.name.endswith(name)), "")
     some = [one for one in part.samples if listed in names_in(one)]
     return {tuple(map(str, names)) for names in fields_of(some, listed)}
-
-
-def _telling(fields: Sequence[FieldReport]) -> list[FieldReport]:
-    """Leave out velocities in the pose's axes if the robot only moves forwards: v says it all."""
-    ways = [one for one in fields if one.path.endswith(("linear.y", "linear.z"))]
-    ahead = all(one.low == one.high for one in ways)
-    return [one for one in fields if not (ahead and f"@{WORLD}" in one.path)]
 
 
 def _field(path: str, parts: Sequence[Floats]) -> FieldReport:
@@ -328,14 +319,5 @@ def _field(path: str, parts: Sequence[Floats]) -> FieldReport:
 
 
 def _noise(values: Floats) -> float:
-    """Return a robust standard deviation of a signal's white noise, from second differences.
-
-    Those are mostly 0 of a sensor that comes in steps and often repeats its value: its noise is
-    then STEP of one.
-    """
-    noise = float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))
-    if not (np.diff(values) == 0).mean() > REPEATS:
-        return noise
-    from grounded.accounts.signals import quantum
-
-    return max(noise, STEP * quantum([values]))
+    """Return a robust standard deviation of a signal's white noise, from second differences."""
+    return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))

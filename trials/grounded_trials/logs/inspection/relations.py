@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -15,8 +15,7 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy, unwound
-from grounded_trials.logs.signals import Series, SignalSpec, read_signals
-from grounded_trials.within import OverBudget
+from grounded_trials.logs.signals import SignalSpec, read_signals
 
 FOLLOWS, SURELY = 0.8, 0.95  # correlation of a rate with a derivative: named so, or not
 SAME = 0.15  # relative tolerance of the size of a rate
@@ -81,12 +80,7 @@ class Signals:
         more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
         clocks = {p: self.log.clock(self.log.topic_of(p)) for p in more}
         specs = {p: SignalSpec(p, clock=clock) for p, clock in clocks.items()}  # type: ignore[arg-type]
-        try:
-            series = read_signals(self.log.files, specs, self.log.layout) if specs else {}
-        except OverBudget:
-            raise
-        except GroundedError:
-            series = _one_by_one(self.log, specs)
+        series = read_signals(self.log.files, specs, self.log.layout) if specs else {}
         for path, one in series.items():
             try:
                 found = tidy(path, one, unwrap="@rpy" in path)
@@ -159,13 +153,3 @@ class Signals:
             if not {one for q, (w, _) in pairs.items() for one in (q, w)} & {a, b}:
                 pairs[a] = (b, times)
         return pairs
-
-
-def _one_by_one(log: LogReport, specs: Mapping[str, SignalSpec]) -> dict[str, Series]:
-    found: dict[str, Series] = {}
-    for path, spec in specs.items():
-        try:
-            found |= read_signals(log.files, {path: spec}, log.layout)
-        except GroundedError:
-            continue
-    return found

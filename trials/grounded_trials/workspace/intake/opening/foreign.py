@@ -21,13 +21,13 @@ from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
 from grounded_trials.logs.inspection.inspect_log import inspect_log
-from grounded_trials.logs.log_files import kind_of, log_records, read_apart
+from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signals, misread
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
-from grounded_trials.store.own_files import CANDIDATE
+from grounded_trials.store.own_files import format_of
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
@@ -213,15 +213,12 @@ def mapping_of(workspace: Folder, path: Path) -> LogMapping:
         GroundedError: if there is no [log] table, or the file is not a log.
     """
     model, files = workspace.base_model, log_files(path)
-    if not path.is_dir() and (kind := kind_of(path)):  # compressed: its checksums can't be checked
-        head = f"candidate {path.stem}" if kind == CANDIDATE else None
-        raise refused("file.no_log", path, head=head)
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     if mapping is not None:
         return mapping
     if (path / FILE).is_file():
         raise refused("file.no_log", path, own=1)
-    own = [file for file in files if kind_of(file)] if path.is_dir() else []
+    own = [file for file in files if format_of(file)] if path.is_dir() else []
     if own:
         newest = str(max(own, key=lambda file: file.stat().st_mtime))
         raise refused("file.no_log", path, own=1, then=NextCommand("ingest", (newest,)))
