@@ -217,7 +217,6 @@ def test_a_table_cut_in_its_last_row_ends_before_it_and_its_unit_counts(tmp_path
         ("a,b\n3,4\n", ("a and b", "'t'")),
         ("t,b\n0,4\n1\n2,4", ("line 3", "1", "2")),
         ("t,b\n1e30,4\n", ("'t'", "1e+30")),
-        ("run_time,b\n0,4\n1,4\n2,4\n", ("'run_time' increases", "'t'", "_ms")),
         ("time,b\nyesterday,4\n", ("line 2", "'time'", "'yesterday'", "2026-11-21 10:05:00")),
         ("time,b\n0,4\n,4\n", ("'time'", "1 row")),
         ("t,b\n0,0,5\n1,0,75\n", ("line 2", "3 cells", "2 columns", "decimal sign", "semicolons")),

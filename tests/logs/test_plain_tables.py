@@ -281,15 +281,6 @@ def in_ms(path, column="t", seconds=1e-3):
     return path
 
 
-def test_times_in_ms_are_asked_about(tmp_path):
-    made = begin(tmp_path / "w", in_ms(tmp_path / "a.csv"), kind="generic", inputs=["force"])
-    assert of_code(made, "start.interval")
-    assert not of_code(made, "file.odd_values")  # the row at 0 is no fault
-    renamed = in_ms(tmp_path / "b.csv", column="t_ms")
-    again = begin(tmp_path / "w-2", renamed, kind="generic", inputs=["force"])
-    assert again.dt < 2 and not of_code(again, "start.interval")
-
-
 def test_times_in_ms_since_1970_are_known_by_their_size_under_any_name(tmp_path):
     in_ms(tmp_path / "a.csv", "time_s")
     rows = np.loadtxt(tmp_path / "a.csv", delimiter=",", skiprows=1)

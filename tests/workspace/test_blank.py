@@ -274,11 +274,3 @@ def test_a_broken_grounded_toml_is_told_before_a_target_is_written(w, change, na
     with pytest.raises(GroundedError, match=holding(named)):
         w.target({"theta": LINE})
     assert files(w) == before
-
-
-@pytest.mark.parametrize(("end", "told"), [(1.5, False), (90.0, True)])
-def test_a_table_in_degrees_is_told(w, tmp_path, end, told):
-    rows = "".join(f"{0.02 * k:.2f},{end * k / 100}\n" for k in range(101))
-    (table := tmp_path / "mine.csv").write_text("t,theta\n" + rows)
-    done = grounded("-C", w.folder, "target", table, "--json").json
-    assert ("start.degrees" in {one["code"] for one in done["findings"]}) == told

@@ -44,7 +44,7 @@ FILE: dict[str, Entry] = {
         "{about} [[begins with '{line}', not with column names]][[!line? has no column of "
         "times]][[ among {names}]]",
         "[[line? name the columns: `--columns t,x,v`, or `columns` in [log]; ]]"
-        f"add or name {_STAMPS}[[; '{{rises}}' increases in every row]]; or give the rate of "
+        f"add or name {_STAMPS}; or give the rate of "
         "its rows [Hz], `--rate 100`, or `rate = 100` in [log]",
     ),
     "times": refuse(
@@ -53,8 +53,7 @@ FILE: dict[str, Entry] = {
     ),
     "row": refuse(
         "{about}[[, line {line},]] has {has} cells, but {names:column} {names:is/are} named",
-        "[[export it with a point as decimal sign, or with semicolons or tabs between the "
-        "columns{comma:1=}]]",
+        "export it with a point as decimal sign, or with semicolons or tabs between the columns",
     ),
     "rows": refuse(
         "{about} has {rows} rows below its header[[, expected {needs} or more]]",
@@ -248,10 +247,8 @@ START: dict[str, Entry] = {
         "declare angles = {declared} in model.py",
     ),
     "interval": note(
-        "[[the log's commands change every {every:.3g} s; dt is {dt:.3g} s]][[read"
-        " as seconds, its rows are {apart:.3g} s apart]]",
-        "[[every? [task] dt (--dt) sets another]][[apart? if the times are in ms or us, end that "
-        "column's name with _ms or _us and create the workspace again in another folder]]",
+        "the log's commands change every {every:.3g} s; dt is {dt:.3g} s",
+        "[task] dt (--dt) sets another",
     ),
     # what the file of a model says
     "unmoved": note(
@@ -262,11 +259,6 @@ START: dict[str, Entry] = {
         "{about} {about:starts/start} in the middle of {about:its range/their ranges}, which "
         "{about:does/do} not include 0",
         "set [task] start",
-    ),
-    "degrees": note(
-        "{about} is in rad by the model: {turns:.2g} turns",
-        "[[if you meant degrees, use `--to {about}={to}`]][[!to? if in degrees, multiply it by "
-        "{scale:.8g}]]",
     ),
     "no_start": refuse(
         "{about} can't begin a workspace: {why:own=grounded wrote it,text=it holds no "

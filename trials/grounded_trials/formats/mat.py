@@ -138,14 +138,7 @@ def _is_of_array(field: Any) -> bool:
 def _tables(
     content: Any, at: tuple[str, ...], outer: Floats | None, path: Path
 ) -> Iterator[tuple[str, Floats, Columns]]:
-    """Yield the tables in a struct, with topic and times: its own, then those inside.
-
-    Args:
-        content: the struct.
-        at: where it stands.
-        outer: (N,) times of the struct around it, for one without.
-        path: of the file, for messages.
-    """
+    """Yield the tables in a struct, with topic and times: its own, then those inside."""
     if isinstance(content, list):
         content = {_called(one) or f"{at[-1]}{i}": one for i, one in enumerate(content)}
     elif isinstance(content, Mapping) and _called(content) != at[-1]:

@@ -132,7 +132,6 @@ class About:
     """What a file says of its tables, and what is odd about them."""
 
     units: Mapping[str, str] = field(default_factory=dict)  # of its numbers, by message path
-    timed: bool = False  # its times are in seconds (`time_s`, `time [s]`), or times of day
     findings: tuple[Finding, ...] = ()
 
 
@@ -257,10 +256,6 @@ PARSERS: dict[int, Callable[[Fields], Record]] = {
 
 def chunk_content(content: bytes | memoryview, *, packed: bool = True) -> tuple[bytes, bool]:
     """Return the decompressed records of a chunk, and whether it has a checksum.
-
-    Args:
-        content: of the chunk record.
-        packed: whether it may be compressed.
 
     Raises:
         BadRecord: for a wrong checksum or size, another compression, or damaged content.

@@ -237,10 +237,6 @@ class Part:
 def by_topic(records: Iterable[Record], name: str) -> Iterator[Record | Topic | Part]:
     """Yield records with topics in place of schemas and channels, and messages with theirs.
 
-    Args:
-        records: of one file.
-        name: of the file, for messages.
-
     Raises:
         DamagedFile: for messages whose channel is not defined.
     """

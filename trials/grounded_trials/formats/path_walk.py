@@ -63,11 +63,6 @@ class Found:
 def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
     """Evaluate a path on messages.
 
-    Args:
-        part: the messages.
-        path: the path.
-        stamps: whether to read the time stamps too; only numbers with one are then returned.
-
     Raises:
         BadMessage: for a stamp outside the calendar.
         BadPath: if a message has no number at the end of the path, suggesting the nearest name.
@@ -260,13 +255,7 @@ def _times(stamps: Values, messages: Ints) -> Ints:
 
 
 def _apply(values: Values, function: str, *, columns: bool = False) -> Floats:
-    """Return the numbers at the end of a path, of its function if it has one.
-
-    Args:
-        values: objects, or the only one, whose numbers are columns.
-        function: one of `FUNCTIONS`, or "".
-        columns: whether they are columns.
-    """
+    """Return the numbers at the end of a path, of its function if it has one."""
     kind = function.rpartition(".")[2]
     if kind in ANGLES:
         return _angle(kind, _turn(values))

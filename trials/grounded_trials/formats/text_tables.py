@@ -40,7 +40,6 @@ PREAMBLE = 100  # largest number of lines above the column names
 LOOK = 65536  # bytes and characters that show the encoding and the separator
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
-SECONDS = re.compile(r"(^|[\W_])s(ec|ecs|econds)?[\])]?$")  # at the end of a column's name
 CLOCK = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d*)?)$")
 
 
@@ -63,7 +62,7 @@ def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     """
     lines = _lines(path)
     head = _head_by(layout.columns, lines, path) if layout.columns else _head(lines, path)
-    time = "" if layout.rate else _times_among(head, lines, path)
+    time = "" if layout.rate else _times_among(head, path)
     cut, width = _cut(lines, head), len(head.names)
     date = next((i for i, n in enumerate(head.names) if n.lower() in DATES and n != time), None)
 
@@ -71,7 +70,8 @@ def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     numbers, texts = array("d"), list[tuple[int, str, str]]()
     for line, cells in _rows(lines[: cut[0] - 1] if cut else lines, head):
         if any(cells[width:]) or len(cells) < width:
-            raise _misfit(path, line, cells, head)
+            facts: dict[str, Any] = {"line": line, "has": len(cells), "names": width}
+            raise GroundedError(found("file.row", str(path), **facts))
         numbers.extend(_number(cell, head.mark) for cell in cells[:width])
         text = cells[head.names.index(time)] if time else ""
         if texts or (len(numbers) == width and text and np.isnan(_number(text, head.mark))):
@@ -82,11 +82,11 @@ def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     columns: dict[str, Any] = columns_by_name(zip(head.names, values.T, strict=True), path)
     columns |= {time: _stamps(texts, time, path)} if texts else {}
     tables = Described({"/csv": columns})
-    tables.about = _about(head, lines, time, path)
+    tables.about = _about(head, lines, path)
     return tables
 
 
-def _about(head: _Head, lines: Sequence[str], time: str, path: Path) -> About:
+def _about(head: _Head, lines: Sequence[str], path: Path) -> About:
     """Return the units in the column names, `x [m]` or `x (m)`, and an incomplete last row."""
     said = {
         name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
@@ -95,10 +95,7 @@ def _about(head: _Head, lines: Sequence[str], time: str, path: Path) -> About:
     units = {f"/csv.{name}": m[1] for name, m in said.items() if m and '"' not in m[1]}
     cut = _cut(lines, head)
     odd = [found("file.cut", str(path), line=str(cut[0]), text=cut[1][:80])] if cut else []
-    row = next((cells for _, cells in _rows(lines[: head.rows + PREAMBLE], head)), [])
-    at = head.names.index(time) if time else len(head.names)
-    named = any(SECONDS.search(cell.lower()) for cell in head.cells[at : at + 1])
-    return About(units, named or ":" in "".join(row[at : at + 1]), tuple(odd))
+    return About(units, tuple(odd))
 
 
 def _rows(lines: Sequence[str], head: _Head) -> Iterator[tuple[int, list[str]]]:
@@ -122,15 +119,6 @@ def _cut(lines: Sequence[str], head: _Head) -> tuple[int, str] | None:
     ends = [np.isnan(_number(cells[-1], head.mark)) for cells in (last, *before) if cells]
     half = bool(lines[-1]) and ends == [True, False]
     return (there[0] + 1, text) if half or len(last) < len(head.names) else None
-
-
-def _misfit(path: Path, line: int, cells: Sequence[str], head: _Head) -> GroundedError:
-    """Return the error for a row with a wrong number of cells, saying what may be its cause."""
-    names, has = len(head.names), len(cells)
-    twice = head.mark == "," and names < has <= 2 * names
-    comma = twice and all("." not in cell and _share([cell]) == 1 for cell in cells)
-    facts: dict[str, Any] = {"line": line, "has": has, "names": names, "comma": int(comma)}
-    return GroundedError(found("file.row", str(path), **facts))
 
 
 def _lines(path: Path) -> list[str]:
@@ -229,28 +217,18 @@ def _share(cells: Sequence[str]) -> float:
     return len(held) / max(len(full), 1)
 
 
-def _time_in(head: _Head) -> str:
-    """Return the name of the column of times, "" for none."""
-    return time_among(head.names) or next((n for n in head.names if n.lower() in DATES), "")
-
-
-def _times_among(head: _Head, lines: Sequence[str], path: Path) -> str:
+def _times_among(head: _Head, path: Path) -> str:
     """Return the name of the column of times.
 
     Raises:
-        GroundedError: if there is none, suggesting a column whose values increase.
+        GroundedError: if there is none.
     """
-    if named := _time_in(head):
+    if named := time_among(head.names):
         return named
-    rows = [cells for _, cells in _rows(lines[: head.rows + PREAMBLE], head)]
-    rising = (n for i, n in enumerate(head.names) if n and _rises([r[i : i + 1] for r in rows]))
+    if date := next((name for name in head.names if name.lower() in DATES), ""):
+        return date
     names = tuple(filter(None, head.names[:8]))
-    raise GroundedError(found("file.no_times", str(path), names=names, rises=next(rising, "")))
-
-
-def _rises(cells: Sequence[Sequence[str]]) -> bool:
-    values = [_number(cell[0], ";") for cell in cells if cell]
-    return len(values) > 2 and bool(np.all(np.diff(values) > 0))
+    raise GroundedError(found("file.no_times", str(path), names=names))
 
 
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:

@@ -62,10 +62,6 @@ FORMATS = (
 def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
     """Yield the records of one file of any supported format; only in `read_apart`.
 
-    Args:
-        path: the file.
-        layout: the names and the rate of a table that does not say them.
-
     Raises:
         GroundedError: if it can't be read, is damaged, or is not a log.
     """

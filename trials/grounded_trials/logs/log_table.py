@@ -35,11 +35,6 @@ LATEST_S = 1e-9 * LATEST
 def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> LogMapping | None:
     """Parse the [log] table; None if there is none.
 
-    Args:
-        table: the [log] table.
-        states: names of the model's states.
-        inputs: names of the model's inputs.
-
     Raises:
         GroundedError: for an unknown key or name, or a value of the wrong kind.
     """
@@ -232,10 +227,6 @@ def misread(model: Model, mapping: LogMapping | None) -> list[Finding]:
     """Return angles that are read from a part of a quaternion, and lengths from angles.
 
     The data may not show it: the z of an orientation is sin(yaw / 2), as smooth as a yaw.
-
-    Args:
-        model: the model with the states.
-        mapping: the column of each signal; None if there is no [log].
     """
     some = []
     for name, one in (mapping.states if mapping else {}).items():

@@ -71,10 +71,6 @@ class Recovery(Document):
 def recover_log(source: str | Path, target: str | Path) -> Recovery:
     """Write what can be saved of a log to a new file.
 
-    Args:
-        source: the damaged file; it is not changed.
-        target: the file to write; it must not exist.
-
     Raises:
         GroundedError: if nothing can be saved, `source` can't be read, or `target` can't be
             written.

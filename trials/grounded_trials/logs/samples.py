@@ -81,11 +81,7 @@ class Samples:
         return max(GAP_INTERVALS * self.interval, GAP_STEPS * dt, GAP_S)
 
     def check_linear(self, dt: float) -> None:
-        """Raise an error if interpolation is impossible: one sample, or far too few for the steps.
-
-        Args:
-            dt: control step [s].
-        """
+        """Raise an error if interpolation is impossible: one sample, or far too few for steps."""
         if len(self.t) < 2:
             raise _unusable(self.name, self.spec, "one")
         if self.interval > SPARSE * dt and self.spec.max_age_s is None:
@@ -115,11 +111,6 @@ class Samples:
 
     def hold(self, at: Ints, dt: float, origin: int) -> Floats:
         """Return the value of the last sample before each time (zero-order hold).
-
-        Args:
-            at: (M,) times [ns].
-            dt: control step [s].
-            origin: the trial's start, for messages [ns].
 
         Raises:
             GroundedError: if there is no such sample, or it is older than max_age_s; or older than
@@ -310,10 +301,6 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
     """Raise an error if some signals end before others begin: their stamps are on two clocks.
 
     The end of a signal that is held, or sent rarely, is ignored: it stays in force after that.
-
-    Args:
-        states: the samples of each state, on the clocks chosen in [log].
-        inputs: the samples of each input, likewise.
 
     Raises:
         GroundedError: naming the signals of both clocks, and the delay_s that aligns them.

@@ -99,12 +99,7 @@ def check_clocks(series: Mapping[str, Series]) -> list[Finding]:
 
 
 def vanished(series: Sequence[Samples], last: int) -> list[Finding]:
-    """Find a signal that ends the trial, long before the others end.
-
-    Args:
-        series: of states.
-        last: the trial's end [ns].
-    """
+    """Find a signal that ends the trial, long before the others end."""
     ends = {samples.name: int(samples.t[-1]) for samples in series}
     origin = min((int(samples.t[0]) for samples in series), default=0)
     gone = [name for name, end in ends.items() if end <= last]

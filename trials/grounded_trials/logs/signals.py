@@ -79,11 +79,6 @@ def read_signals(
 ) -> dict[str, Series]:
     """Read signals from a log: a file, files in order, or the folder of a bag.
 
-    Args:
-        paths: a log of any format, several in order, or a folder with them.
-        specs: what to read, by name.
-        layout: the names and the rate of a table that does not say them.
-
     Raises:
         GroundedError: for a damaged file, a missing topic or field, a message with more than one
             value for a signal, or a clock that a topic does not have.

@@ -92,12 +92,7 @@ def _parts(path: str) -> tuple[str, str]:
 
 
 def unit_of(path: str, joints: Mapping[str, str] | None = None) -> str:
-    """Return the unit of a path's number by convention, "" if there is none.
-
-    Args:
-        path: a message path.
-        joints: units of joints' numbers by path, if the joints' names are known.
-    """
+    """Return the unit of a path's number by convention, "" if there is none."""
     if joints and path in joints:
         return joints[path]
     for pattern, unit in UNITS:

@@ -33,8 +33,8 @@ from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
 from grounded_trials.starting.first_toml import write_first
-from grounded_trials.starting.interval import interval_of
 from grounded_trials.starting.kinds import (
+    COMMANDED,
     KINDS,
     Clues,
     kind_in,
@@ -50,9 +50,12 @@ from grounded_trials.toml_table import Table
 from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.model_file import load_module, model_in
 
-SLOWEST = 0.5  # [Hz] smallest plausible row rate; below it, times may be in another unit
 NAMED = 5  # most columns named in an error
 HORIZON = 200  # largest number of steps of a target taken from a recorded run
+RATES = (1000, 500, 400, 250, 200, 125, 120, 100, 60, 50, 40, 30, 25, 20, 15, 10, 5, 2)  # [Hz]
+STEPS = tuple(float(f"{1 / rate:.6g}") for rate in RATES)  # [s], rounded as written to files
+GUESSED = 0.05  # [s], if nothing is known
+ROUNDING = 0.03  # relative tolerance for rounding to one of STEPS
 Ask = Callable[[Guess], str]
 
 
@@ -140,7 +143,7 @@ def begin(
         model: the user's model.py, or an MJCF or URDF file; it is copied together with the files
             that it reads from its folder. None: a skeleton is written.
         kind: kind of the skeleton, see `KINDS`; None: guessed from the log.
-        dt: control interval [s]; None: that of the commands in the log, see `interval_of`.
+        dt: control interval [s]; None: that of the commands in the log.
         inputs: names of the numbers that are inputs of a generic skeleton; empty: guessed.
         layout: the names and the rate of a table that does not say them; kept in [log].
         ask: called with each uncertain signal, returns the path to use; None: use the best guess.
@@ -166,10 +169,9 @@ def begin(
         units = {**drawn.model.states, **drawn.model.inputs}
         states, commands = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
         drawn.with_gain((*states, *commands))
-        slow = () if layout.rate or report.timed else _in_seconds(report)
 
         # The control interval, and the ranges: zero is sent after a run, so limits must include it.
-        step = dt or interval_of(report, commands, states)
+        step = dt or _interval_of(report, commands, states)
         made = own.in_step(folder, drawn.model, step) if own else drawn.model
         ranges = {g.name: g.extent for g in (*states, *commands)}
         for g in commands:
@@ -193,7 +195,7 @@ def begin(
             states=tuple(states),
             inputs=tuple(commands),
             target=f"{horizon * step:.3g} s of the log" if sampled else "zeros",
-            findings=(*notes, *drawn.notes, *slow, *more, *odd_run),
+            findings=(*notes, *drawn.notes, *more, *odd_run),
         )
 
 
@@ -305,10 +307,29 @@ def _on_own(report: LogReport, guesses: Sequence[Guess], model: Model) -> Iterat
         yield found("start.unmoved", *without)
 
 
-def _in_seconds(report: LogReport) -> tuple[Finding, ...]:
-    """Return a note for each table whose times seem to be in another unit than seconds."""
-    slow = [t for t in report.topics if t.topic == "/csv" and 0 < t.rate_hz < SLOWEST]
-    return tuple(found("start.interval", t.topic, apart=1 / t.rate_hz) for t in slow)
+def _interval_of(report: LogReport, inputs: Sequence[Guess], states: Sequence[Guess]) -> float:
+    """Estimate the control interval of a log [s]."""
+    rivals = [next((p for p in g.others if COMMANDED.search(p.lower())), "") for g in inputs]
+    sent = [one.path or rival for one, rival in zip(inputs, rivals, strict=True)]
+    for paths in (sent, [one.path for one in states]):
+        topics = [report.topic_of(path) for path in paths]
+        rates = [topic.rate_hz for topic in topics if topic is not None and topic.rate_hz > 0]
+        if rates:
+            return _rounded(1 / min(rates))
+    return GUESSED
+
+
+def _rounded(rows: float) -> float:
+    """Round the interval of a log's rows [s] to a usual rate, else to whole Hz or ms.
+
+    It is at least the smallest of `STEPS`. Slow processes are logged every few seconds.
+    """
+    usual = min(STEPS, key=lambda step: abs(np.log(step / rows)))
+    if abs(usual / rows - 1) < ROUNDING or not STEPS[0] < rows:
+        return usual
+    whole = 1e-3 * max(round(1e3 * rows), 1), 1 / max(round(1 / rows), 1)
+    nearest = min(whole, key=lambda step: abs(step - rows))
+    return float(f"{nearest if abs(nearest / rows - 1) < ROUNDING else rows:.6g}")
 
 
 def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str, str]) -> Guess:

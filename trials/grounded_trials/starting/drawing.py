@@ -15,7 +15,6 @@ from grounded.checks import refused, unknown
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.frozen import Array
-from grounded.model import Model
 from grounded.places import velocities
 from grounded.result import UNSAID, Document
 from grounded_trials.logs.inspection.inspect_log import inspect_log
@@ -103,7 +102,6 @@ def _holds(table: Path, mapping: LogMapping) -> bool:
 
 SECONDS = 5.0  # default duration of a step
 STRAIGHT = 1e3  # times its size: larger turning radii are those of a straight line
-TURNS = 2.0  # a larger angle brings a warning: it may be meant in degrees
 
 Weights = dict[str, dict[str, float]]  # by kind (state, terminal, input_change) and name
 
@@ -161,30 +159,8 @@ class Drawn(Document):
     then: NextCommand = field(metadata=UNSAID)
 
 
-@dataclass(frozen=True, eq=False)
-class _Case:
-    """What the findings on a target are read from."""
-
-    workspace: Folder  # with the new target
-    asked: Manoeuvre
-    columns: Mapping[str, Array]
-    free: Sequence[str]
-    begins: Mapping[str, float]  # what is new in [task] start
-    seen: str  # the trial that rests there
-    reward: Weights
-
-    @property
-    def units(self) -> Mapping[str, str]:
-        model: Model = self.workspace.base_model
-        return model.states
-
-
 def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     """Write a manoeuvre to the workspace's target, with its length and usual weights.
-
-    Args:
-        workspace: the workspace.
-        asked: the manoeuvre.
 
     Raises:
         GroundedError: if it can't be drawn for this model; the files are then as before.
@@ -213,9 +189,10 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     # What is told of it.
     reward = _reward(workspace)
     free = tuple(name for name in model.states if name not in columns)
+    new = ", ".join(f"{name} = {figure(value)}" for name, value in rest.items())
+    begun = [found("target.start", seen, start=new)] * bool(rest)
     planar = asked.is_path and has_plane(model)
     along = driven(model, columns, old.dt) if planar else (math.nan, math.inf)
-    case = _Case(workspace, asked, columns, free, rest, seen, reward)
     return Drawn(
         path,
         {name: (float(v.min()), float(v.max())) for name, v in columns.items()},
@@ -225,7 +202,7 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
         free,
         (along[0], along[1] if along[1] < STRAIGHT * asked.drive.size else math.inf),
         {kind: own for kind, own in reward.items() if own != before.get(kind, {})},
-        settle(one for tell in TOLD for one in tell(case)),
+        settle(_told(workspace, asked, columns, reward, begun)),
         INSPECT if unmapped(workspace) else NextCommand("propose"),
     )
 
@@ -250,62 +227,37 @@ def _reward(workspace: Folder) -> Weights:
     return dict(written.get("reward", {}))
 
 
-# What is told
-
-
-def _in_degrees(case: _Case) -> Iterator[Finding]:
-    given, columns = case.asked.to, {} if case.asked.is_path else case.columns
-    largest = {name: max(column, key=abs) for name, column in columns.items()} | dict(given)
-    for name, value in largest.items():
-        turns = abs(float(value)) / (2 * math.pi)
-        if case.units.get(name) == "rad" and turns > TURNS:
-            to = f"{math.radians(value):.4g}" if name in given else None
-            scale = math.radians(1.0)
-            yield found("start.degrees", name, turns=turns, to=to, scale=scale)
-
-
-def _weighed_without_column(case: _Case) -> Iterator[Finding]:
-    kinds = (case.reward.get(kind, {}) for kind in ("state", "terminal"))
+def _told(
+    workspace: Folder,
+    asked: Manoeuvre,
+    columns: Mapping[str, Array],
+    reward: Weights,
+    begun: Sequence[Finding],
+) -> Iterator[Finding]:
+    """Yield what is told of a new target."""
+    # States that are weighed although they are free.
+    model, config = workspace.base_model, workspace.config
+    kinds = (reward.get(kind, {}) for kind in ("state", "terminal"))
     weighed = {name for kind in kinds for name, weight in kind.items() if weight}
-    if about := [name for name in case.free if name in weighed]:
-        rates = velocities(case.workspace.base_model) if case.asked.shape == "line" else ()
+    if about := [name for name in model.states if name in weighed - {*columns}]:
+        rates = velocities(model) if asked.shape == "line" else ()
         to = " ".join(f"--to {name}={'0' if name in rates else 'VALUE'}" for name in about)
-        path = case.asked.is_path and not case.asked.to
+        path = asked.is_path and not asked.to
         yield found("given.unweighed", *about, to=None if path else to, weight=Weight.WARN)
 
+    # What is of the log it all began with.
+    if config.seen_in:
+        yield found("plan.limits_of_log", log=config.seen_in)
+    if (lost := unmapped(workspace)) is not None:
+        yield lost
 
-def _begins(case: _Case) -> Iterator[Finding]:
-    if case.begins:
-        yield found("target.start", case.seen, start=_equal(case.begins))
-
-
-def _beyond_safety(case: _Case) -> Iterator[Finding]:
-    bounds = case.workspace.config.safety.pairs(list(case.units))
-    for name, column in case.columns.items():
+    # Columns that leave [safety].
+    bounds = config.safety.pairs(list(model.states))
+    for name, column in columns.items():
         least, most = bounds.get(name, (-math.inf, math.inf))
         low, high = float(column.min()), float(column.max())
         if low < least or high > most:
-            end = low if low < least else high
-            goes = Quantity(end, case.units[name])
+            goes = Quantity(low if low < least else high, model.states[name])
             facts: dict[str, Any] = {"state": name, "value": goes, "low": least, "high": most}
             yield found("plan.outside", name, table="safety", weight=Weight.WARN, **facts)
-
-
-def _of_log(case: _Case) -> Iterator[Finding]:
-    if log := case.workspace.config.seen_in:
-        yield found("plan.limits_of_log", log=log)
-    if (lost := unmapped(case.workspace)) is not None:
-        yield lost
-
-
-def _equal(by_name: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} = {figure(value)}" for name, value in by_name.items())
-
-
-TOLD = (
-    _weighed_without_column,
-    _in_degrees,
-    _of_log,
-    _beyond_safety,
-    _begins,
-)
+    yield from begun

@@ -28,7 +28,6 @@ from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, 
 
 Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
 HELD = 0.3  # share of samples equal to the previous one, above which a number is a command
-QUIET = 10.0  # range of a number of noise alone, in standard deviations of that, at most
 MOST_STATES, MOST_INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
 COMMANDED = re.compile(
@@ -63,13 +62,6 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
     return found
 
 
-def _noise_only(field: FieldReport) -> bool:
-    """Return whether a number never moves beyond its noise, as the roll rate of a car does."""
-    if field.low is None or field.high is None:
-        return False
-    return field.high - field.low < QUIET * field.noise
-
-
 def called_input(name: str, path: str, beside: Collection[str]) -> bool:
     """Return whether more in a number's name, beside all names, speaks for a command than not."""
     speaks_for = bool(COMMANDED.search(path.lower())) + bool(SIDES.search(name))
@@ -81,12 +73,8 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
 
     A state whose rate is another state gets that as its derivative; every other state follows the
     inputs with a first-order lag, its own command alone if each input is the command of a state.
-    Numbers of noise alone are no states. Without `inputs`, the inputs are the numbers that are
-    named like commands, else those held constant over several samples while others move.
-
-    Args:
-        clues: of the log.
-        inputs: names of the numbers that are inputs, in order; empty: guessed as above.
+    Without `inputs`, the inputs are the numbers that are named like commands, else those held
+    constant over several samples while others move.
 
     Raises:
         GroundedError: for an input that the log does not have.
@@ -103,9 +91,7 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     inputs = inputs or guessed or ["u"]
 
     # The states, and those whose rate is another one.
-    named = [name for name in found if name not in inputs]
-    moved = [name for name in named if not _noise_only(found[name])]
-    states = (moved or named)[:MOST_STATES] or ["x"]
+    states = [name for name in found if name not in inputs][:MOST_STATES] or ["x"]
     rates = _rates(log, {name: found[name].path for name in states if name in found})
 
     # The equations of the others: each lags behind its own command, or behind all inputs.
@@ -181,12 +167,7 @@ def _word(path: str) -> str:
 
 
 class Clues:
-    """What in a log shows the kind of robot.
-
-    Args:
-        log: an inspected log.
-        joints: names of its joints by topic, see `joint_names`.
-    """
+    """What in a log shows the kind of robot."""
 
     def __init__(self, log: LogReport, joints: Joints) -> None:
         self.log, self.joints, self.stated = log, joints, log.stated
@@ -319,13 +300,7 @@ def _car(clues: Clues) -> Skeleton:
 
 
 def pushed(plain: Skeleton, sent: Mapping[str, str], stated: Stated) -> Skeleton:
-    """Return a skeleton driven by the log's only motor command, if that has no speed command.
-
-    Args:
-        plain: a skeleton with the input `speed`.
-        sent: paths of the log's commands, by their names.
-        stated: the units that the log states.
-    """
+    """Return a skeleton driven by the log's only motor command, if that has no speed command."""
     if any(SPEED.search(path.lower()) for path in sent.values()):
         return plain
     motors = {name: path for name, path in sent.items() if MOTOR.search(path.lower())}
@@ -342,13 +317,7 @@ def pushed_by(plain: Skeleton, command: str, unit: str) -> Skeleton:
 
 
 def with_gain(plain: Skeleton, found: Mapping[str, Guess], log: LogReport) -> Skeleton:
-    """Return such a skeleton with the gain that the log shows; others unchanged.
-
-    Args:
-        plain: a skeleton of any kind.
-        found: the log's signals, by the skeleton's names.
-        log: the log.
-    """
+    """Return such a skeleton with the gain that the log shows; others unchanged."""
     told = plain.params.get("gain", "").split('"')
     v, drive = found.get("v"), next((n for n in plain.inputs if f"p.gain * a.{n}" in _v(plain)), "")
     u = found.get(drive)

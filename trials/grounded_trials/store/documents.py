@@ -35,10 +35,6 @@ _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 def write_document(path: Path, document: Mapping[str, Any]) -> None:
     """Write a JSON document with its checksum, atomically.
 
-    Args:
-        path: the file.
-        document: the contents.
-
     Raises:
         GroundedError: if it can't be written.
         ValueError: if a number is not finite.
@@ -99,10 +95,6 @@ class Notes:
 
     def add(self, note: Mapping[str, str], *, again: bool = True) -> None:
         """Add a note.
-
-        Args:
-            note: its contents.
-            again: add it even if an equal note exists.
 
         Raises:
             GroundedError: if it can't be written.

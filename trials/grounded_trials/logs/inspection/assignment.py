@@ -269,8 +269,8 @@ class _Table:
             own |= {name: self._possible(name, free) for name in bare}
         like = self._likes(own[q], own[w])
 
-        # Each gains what the best pair that it is in explains, less what its partner lacks.
-        before, gains = self.points.copy(), dict[tuple[str, str], float]()
+        # Each gains what the best pair that it is in explains.
+        gains = dict[tuple[str, str], float]()
         for (a, b), one in like.items():
             by = self.factor(q, a), self.factor(w, b)
             stated = [self.stated.unit(path) for path in (a, b)]
@@ -278,11 +278,8 @@ class _Table:
             if not first and len(bare) == 2 and one.tenfold is None:
                 continue
             points = _capped(one) - 1.5 * (not fits) - 0.5 * (one.correlation < 0)
-            for own_key, partner in (((q, a), (w, b)), ((w, b), (q, a))):
-                row = before[self.row[partner[0]]]
-                lost = row.max() - row[self.at[partner[1]]]
-                gain = points - min(lost, CAP)
-                gains[own_key] = max(gains.get(own_key, gain), gain, 0.0)
+            for one_of in ((q, a), (w, b)):
+                gains[one_of] = max(gains.get(one_of, 0.0), points)
         for (name, path), points in gains.items():
             self.add(name, path, points)
 
@@ -299,11 +296,7 @@ class _Table:
             n.path
             for n in free
             if not (unit in LENGTHS and is_angle(n.path))
-            and (
-                not unit
-                or not (n.said or n.known)
-                or factor_between(n.said or n.known, unit) is not None
-            )
+            and ("" in (unit, n.said or n.known) or factor_between(n.said or n.known, unit))
         ]
 
     def _likes(self, first: Sequence[str], second: Sequence[str]) -> dict[tuple[str, str], Follows]:

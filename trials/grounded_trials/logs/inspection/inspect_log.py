@@ -97,11 +97,6 @@ class LogReport:
         return Stated(self.about[0].units if self.about else {})
 
     @property
-    def timed(self) -> bool:
-        """Whether its tables say that their times are in seconds, or of the day."""
-        return any(one.timed for one in self.about)
-
-    @property
     def numbers(self) -> list[FieldReport]:
         """The numbers of all topics."""
         return [field for topic in self.topics for field in topic.fields]
@@ -165,10 +160,6 @@ def _findings(log: LogReport) -> tuple[Finding, ...]:
 
 def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT_SAYS) -> LogReport:
     """Summarise a log; at damage the reading ends, and the damage is reported.
-
-    Args:
-        paths: a log file, several in order, or the folder of a bag.
-        layout: the names and the rate of a table that does not say them.
 
     Raises:
         GroundedError: if a file can't be read, or is not a log.

@@ -78,9 +78,6 @@ def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
     """Return the units of joints' numbers by path: rad for revolute, m for prismatic joints.
 
     "" for a joint whose name does not show its kind.
-
-    Args:
-        joints: see `joint_names`.
     """
     return {
         number_of(topic, kind, i): unit * (slides(joint) or turns(joint))
@@ -117,15 +114,7 @@ class Joint:
 def of_joint(
     name: str, unit: str, joints: Mapping[str, tuple[str, ...]], log: LogReport, *, sent: bool
 ) -> dict[str, Joint]:
-    """Return the numbers of the joint that the name of a state or input contains, by path.
-
-    Args:
-        name: of the state or input.
-        unit: of it, which decides between position, velocity and effort.
-        joints: see `joint_names`.
-        log: an inspected log.
-        sent: whether it is an input.
-    """
+    """Return the numbers of the joint that the name of a state or input contains, by path."""
     for topic, names in joints.items():
         for joint in (joint for joint in names if holds(name, joint)):
             kind = {u: k for k, u in (SLIDING if slides(joint) else TURNING).items()}.get(unit)
@@ -144,11 +133,6 @@ def in_order(
     """Return the numbers of each state and input in order from the base, if none has a name.
 
     There must be as many of a unit as joints. Prismatic joints have states in m, revolute in rad.
-
-    Args:
-        roles: the unit of each state and input without a matching name, and whether it is sent.
-        joints: see `joint_names`.
-        log: an inspected log.
     """
     if len(joints) != 1:
         return {}

@@ -48,7 +48,6 @@ _MEANINGS: dict[str, tuple[str, ...]] = {
     "turn": ("turn", "angular.z", "angular_velocity.z", "turn_rate", "yaw_rate", "omega", "w"),
     "throttle": ("throttle", "gas", "accelerator", "acceleration", "motor"),
     "thrust": ("thrust", "force.z", "throttle"),
-    "brake": ("brake",),
     "torque": ("torque", "effort", "tau"),
 }
 NAMES_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by its unit
@@ -96,15 +95,7 @@ def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) 
 def name_points(
     called: Sequence[str], name: str, topic: TopicReport, field: FieldReport, *, is_input: bool
 ) -> float:
-    """Return how well a number's name fits, 0 for not at all.
-
-    Args:
-        called: the usual names of the state or input, see `meanings`.
-        name: of the state or input.
-        topic: the number's topic.
-        field: the number.
-        is_input: whether a command is sought.
-    """
+    """Return how well a number's name fits, 0 for not at all."""
     plain = bare_command if is_input else without_unit
     ways = {one[len(topic.topic) :].lower().strip('".') for one in (field.path, plain(field.path))}
     best = max(_fit(called, one, topic.topic.lower()) for one in ways)

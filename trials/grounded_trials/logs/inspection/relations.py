@@ -120,11 +120,6 @@ class Signals:
     def lagged(self, sent: str, moved: str, latest: float) -> float | None:
         """Return the largest correlation of a command with what follows it.
 
-        Args:
-            sent: path of the command.
-            moved: path of the signal that may follow it.
-            latest: largest delay [s].
-
         Returns:
             -1 for a constant one; None if the signals don't overlap.
         """
