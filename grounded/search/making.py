@@ -83,9 +83,7 @@ class About:
             found = believed(planner, incumbent, make.now.history, real)
         found = found or Believed(real)
         self.real, self.corrected = found.problem, found.corrected
-        self.alternatives = found.alternatives
         self.missed = found.missed  # likely error of the model's movements, as a share of them
-        self._known_costs: dict[Policy, float] = {}  # in the alternatives
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
@@ -110,27 +108,9 @@ class About:
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
         """Return a candidate with this model's prediction and its likely error."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        made = replace(made, slopes=self.slopes)
-        return self._steadied(made) if made.predicted_gain > self.least else made
-
-    def _steadied(self, made: Candidate) -> Candidate:
-        """Return the same run with the incumbent's gains if the new ones cost more.
-
-        The own plan of a changed model keeps its gains: the incumbent's were designed in a model
-        that lacked what was found since, such as a delay. So do gains that were made gentler.
-        """
-        new, run = made.policy, self.incumbent.candidate.policy
-        own = made.way == "own plan" or made.caution > self.incumbent.candidate.caution
-        own = own or new.gain is None or run.gain is None
-        if self.alternatives and not own:
-            old = replace(new, gain=run.laid_out(new.state_names, new.angles, new.depths).gain)
-            costs = self._disturbed([new, old])
-            if costs[0] - costs[1] > self.least:
-                made = self.make.foretold(made, old, self.real, self.already)
-        if not self.missed:
-            return made
         moved = apart(self.real, (made.predicted_states, made.predicted_inputs), self.run)
-        return replace(made, likely_off=self.missed * moved)
+        off = self.missed * moved if self.missed else 0.0
+        return replace(made, slopes=self.slopes, likely_off=off)
 
     def step_from(self, first: Step) -> Proposal | None:
         """Return the first step worth a trial, else one that is not allowed, else None.
@@ -172,10 +152,8 @@ class About:
                 if proposal.candidate is None:
                     unsafe = proposal
                     continue
-                told = self._told(proposal.candidate)
-                proposal = replace(proposal, candidate=told)
-                if told.expected_gain < self.incumbent.utility:  # it may lose the best cost again
-                    self.doubted = self.doubted or told
+                if made.expected_gain < self.incumbent.utility:  # it may lose the best cost again
+                    self.doubted = self.doubted or made
                 elif made.expected_gain > self.least:
                     return proposal
                 else:
@@ -186,28 +164,10 @@ class About:
                 break
         return doubted or unsafe
 
-    def _disturbed(self, policies: Sequence[Policy]) -> list[float]:
-        """Return the costs of policies in the alternatives; 0 without alternatives.
-
-        Each is found once, and all that are asked for together are run together.
-        """
-        own = self.incumbent.candidate.policy  # it is asked for sooner or later
-        new = [one for one in dict.fromkeys([own, *policies]) if one not in self._known_costs]
-        found = [a.costs(new) for a in self.alternatives if new]
-        self._known_costs.update(zip(new, sum(found, np.zeros(len(new))).tolist(), strict=True))
-        return [self._known_costs[one] for one in policies]
-
     def _near(self, made: Candidate, lost: Rollout) -> bool:
         """Return whether a candidate's run is nearly that of one that lost, in this model."""
         run, other = (made.predicted_states, made.predicted_inputs), (lost.states, lost.inputs)
         return apart(self.real, run, other) <= SAME_STEP**2 * apart(self.real, self.run, other)
-
-    def _told(self, made: Candidate) -> Candidate:
-        """Return the candidate with its likely error raised to what the alternatives imply."""
-        if not self.alternatives:
-            return made
-        own, cost = self._disturbed([self.incumbent.candidate.policy, made.policy])
-        return replace(made, likely_off=max(made.likely_off, made.predicted_gain - (own - cost)))
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """Return the changed model's own plan if its predicted gain exceeds the rival's.
@@ -225,7 +185,7 @@ class About:
         if base.model == make.fingerprint or tried:
             return None
         policy, _ = make.planner.first_policy()
-        made = self._told(self.candidate(for_late_samples(policy, self.real), Step(), "own plan"))
+        made = self.candidate(for_late_samples(policy, self.real), Step(), "own plan")
         promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
         if not (swung or made.expected_gain > max(promise, self.least)):

@@ -48,7 +48,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 
@@ -70,48 +69,6 @@ NEAREST = 12  # nearest trials that are used
 ASKED = 3  # nearest trials that are left out in turn
 LATEST = 100  # latest trials that these are chosen from
 DEAD = 1e-4  # regularisation, relative to the mean square effect of the inputs
-WORST = 1e12  # cost of a run that diverges
-
-
-@dataclass(frozen=True, eq=False)
-class Alternative:
-    """A model that replays the incumbent's trial, and its mispredictions of other trials.
-
-    A predicted run follows its own reference, so its utility does not show how good the gains are
-    under disturbances. New gains can be worse than those of the incumbent: gains on unmeasured
-    states (an effect's memory, `corrected`) are dropped, and corrected derivatives may have been
-    fitted to noise. So a policy is run in models that are disturbed by the mispredictions y_j of
-    OTHER trials,
-
-        x_{t+1} = f(x_t, u_t) + bias_t + y_jt,
-
-    with the same disturbances for all policies (Ng & Jordan, "PEGASUS", UAI 2000), once with the
-    corrected derivatives and once with the model's own. The smaller a model's error on held-out
-    trials, the larger its weight.
-    """
-
-    weight: float
-    problem: Problem
-    off: tuple[Array, ...]  # y_j (H, n)
-
-    def costs(self, policies: Sequence[Policy]) -> Array:
-        """Return the mean cost of policies over the disturbances, times the weight, (P,)."""
-        if self.weight == 0:
-            return np.zeros(len(policies))
-        each = [policy for policy in policies for _ in self.off]
-        found = runs(self._disturbed * len(policies), each)
-        costs = np.minimum([-run.utility for run in found], WORST)
-        return np.asarray(self.weight * costs.reshape(-1, len(self.off)).mean(axis=1))
-
-    @cached_property
-    def _disturbed(self) -> list[Problem]:
-        """The problem with each of the mispredictions added to its bias."""
-        found = []
-        for y in self.off:
-            bias = self.problem.bias.copy()
-            bias[:, : y.shape[1]] += y
-            found.append(replace(self.problem, bias=bias))
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,7 +90,6 @@ class Believed:
     problem: Problem
     corrected: Corrected | None = None
     missed: float = 0.0
-    alternatives: tuple[Alternative, ...] = ()
 
 
 def believed(
@@ -169,21 +125,10 @@ def believed(
         for k, (_, left) in enumerate(fits)
     ]
     law, _ = laws(own, others, grounded)
-    made, near = with_law(law, own, grounded), others[:ASKED]
-    off = unexplained = tuple(o.y for o in near)
-    if law is not None:
-        unexplained = tuple(
-            o.y - np.einsum("tnq,tq->tn", law, _features(own, o, grounded)) for o in near
-        )
     misses = float(np.mean(crude)), float(np.mean(corrected))
-    share = misses[1] / (sum(misses) + 1e-300)
-    both = (
-        Alternative(share, grounded, off),
-        Alternative(1.0 - share, made.problem, unexplained),
-    )
     plain = misses[0] <= misses[1]
-    model, missed = (Believed(grounded), misses[0]) if plain else (made, misses[1])
-    return replace(model, missed=missed, alternatives=both)
+    model = Believed(grounded) if plain else with_law(law, own, grounded)
+    return replace(model, missed=min(misses))
 
 
 def neighbours(

@@ -124,7 +124,7 @@ def gains(made):
 
 
 def test_a_step_after_a_loss_of_gentler_gains_has_no_more_than_those():
-    run = search(0.03, 4)
+    run = search(0.03, 3)
     loud, gentle, *steps = run.candidates
     assert gentle.way == "gentler gains" and not run.history[1].accepted
     assert all(one.way == "" and one.base for one in steps)

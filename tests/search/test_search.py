@@ -106,10 +106,10 @@ def test_trials_that_do_not_improve_raise_the_damping_until_nothing_is_promised(
     story = Story(tolerance=1e-9).add()
     while story.propose().candidate is not None:
         story.add(bad)
-    made = [(c.slopes, c.damping, -c.alpha) for c in story.candidates[1:] if c.way == ""]
-    assert made[0] == ("", 1.0, -1.0) and len(set(made)) == len(made) > 2
-    for slopes in ("", "corrected"):
-        own = [step for kind, *step in made if kind == slopes]
+    made = [((c.way, c.slopes), c.damping, -c.alpha) for c in story.candidates[1:]]
+    assert made[0] == (("", ""), 1.0, -1.0) and len(set(made)) == len(made) > 2
+    for kind in {one for one, *_ in made}:
+        own = [step for one, *step in made if one == kind]
         assert own == sorted(own)
     assert len(made) == len(story.candidates) - 1
     ended = story.propose().standing
