@@ -38,10 +38,9 @@ its mispredictions (`believed_by_step`),
 A dozen trials determine E_t in a dozen directions at most. Ridge regression leaves it zero in all
 others, as a secant method leaves the derivatives across its steps (Broyden, "A class of methods for
 solving nonlinear simultaneous equations", Math. Comp. 19, 1965), with the nearest trials weighted
-most. Lost trials count as much as others: nothing else shows what a step does that lost. The
-penalty is chosen by leaving out the three nearest trials in turn. These derivatives make a step if
-it promises more than any other, each promise less its likely error (`improve`), and the steps after
-that.
+most. Lost trials count as much as others: nothing else shows what a step does that lost. These
+derivatives make a step if it promises more than any other, each promise less its likely error
+(`improve`), and the steps after that.
 """
 
 from __future__ import annotations
@@ -63,7 +62,7 @@ from grounded.trial import mean_trial
 
 PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # ridge penalties
 FADING = (0.0, 2.0)  # the weight of a trial is its distance to minus this power
-PRICES_BY_STEP = (1e-3, 1e-2, 0.1, 1.0, 10.0)  # the same for the laws of single steps
+PRICE_BY_STEP = 0.3  # the same for the laws of single steps
 PARTS = 8  # parts of the run for cross-validation
 NEAREST = 12  # nearest trials that are used
 ASKED = 3  # nearest trials that are left out in turn
@@ -311,90 +310,42 @@ def believed_by_step(
 
     Returns:
         The model and the share of movements that it mispredicts. None if fewer than two other
-        trials are known, or if none of the penalties predicts a trial that is left out.
+        trials are known, or if it does not predict those that are left out.
     """
     known = neighbours(planner, incumbent, history, grounded)
     if known is None or len(known[1]) < 2:
         return None
     own, others = known[0], [other for other, _ in known[1]]
-    dear, asked = worth(own, grounded), others[:ASKED]
-    rests = [Told.by([o for o in others if o is not one], own, grounded) for one in asked]
-    off = [
-        sum(
-            told.off(price, one, own, grounded, dear)
-            for one, told in zip(asked, rests, strict=True)
-        )
-        for price in PRICES_BY_STEP
-    ]
-    price = PRICES_BY_STEP[int(np.argmin(off))]
-    models = [with_law(told.law(price), own, grounded).problem for told in rests]
-    missed = unforetold(models, own, asked)
+    asked = others[:ASKED]
+    rests = [laws_by_step([o for o in others if o is not one], own, grounded) for one in asked]
+    missed = unforetold([with_law(law, own, grounded).problem for law in rests], own, asked)
     if not np.mean(missed) < 1.0:
         return None
-    law = Told.by(others, own, grounded).law(price)
+    law = laws_by_step(others, own, grounded)
     return replace(with_law(law, own, grounded), missed=float(np.mean(missed)))
 
 
-@dataclass(frozen=True, eq=False)
-class Told:
-    """What trials show of the derivatives, beyond the laws of the whole run.
+def laws_by_step(others: Sequence[Seen], own: Seen, grounded: Problem) -> Array:
+    """Return the laws of the whole run plus those of each step, (H, n, 2 n + 2 m).
 
-    Differences and leftovers are in units of each trial's distance from the incumbent's.
+    Args:
+        others: other trials, of which at least one differs.
+        own: the incumbent's trial.
+        grounded: the exact model with the incumbent's bias.
     """
+    d, y, far = moved_near(own, others, grounded)
+    made, _ = laws(own, others, grounded)
+    if made is None:
+        made = np.zeros((*own.x.shape, d.shape[2]))
 
-    whole: Array  # (H, n, 2 n + 2 m) the laws of the whole run
-    d: Array  # (j, H, n + m) differences in [x, u], scaled
-    left: Array  # (j, H, n) what those laws leave of the mispredictions
-    weight: Array  # (j,)
-    scale: Array  # (n + m,)
-
-    @classmethod
-    def by(cls, others: Sequence[Seen], own: Seen, grounded: Problem) -> Told:
-        """Return what `others`, of which at least one differs, show beside the incumbent's trial.
-
-        Args:
-            others: other trials.
-            own: the incumbent's trial.
-            grounded: the exact model with the incumbent's bias.
-        """
-        d, y, far = moved_near(own, others, grounded)
-        whole, _ = laws(own, others, grounded)
-        if whole is None:
-            whole = np.zeros((*own.x.shape, d.shape[2]))
-        left = (y - np.einsum("tnq,jtq->jtn", whole, d)) / far[:, None, None]
-        d = d[:, :, : own.x.shape[1] + own.u.shape[1]] / far[:, None, None]
-        scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12
-        return cls(whole, d / scale, left, (far / far[0]) ** -2.0, scale)
-
-    def law(self, price: float) -> Array:
-        """Return the laws of the whole run plus those of each step (H, n, 2 n + 2 m)."""
-        M = np.einsum("j,jtp,jtq->tpq", self.weight, self.d, self.d)
-        N = np.einsum("j,jtp,jtk->tpk", self.weight, self.d, self.left)
-        E = np.linalg.solve(M + price * np.eye(len(self.scale)), N) / self.scale[:, None]
-        made = self.whole.copy()
-        made[:, :, : len(self.scale)] += E.transpose(0, 2, 1)
-        return made
-
-    def off(self, price: float, other: Seen, own: Seen, grounded: Problem, worth: Array) -> float:
-        """Return the share of another trial's mispredictions that the laws leave, by its cost."""
-        (d,), (y,), _ = moved_near(own, [other], grounded)
-        left = y - np.einsum("tnq,tq->tn", self.law(price), d)
-        return float(np.vdot(worth, left**2) / (np.vdot(worth, y**2) + 1e-300))
-
-
-def worth(own: Seen, grounded: Problem) -> Array:
-    """Return the cost (H, n) of a misprediction of 1 of each state at each step.
-
-    It is that of the states and inputs that follow, under the gains of an LQR about the trial.
-    """
-    n = own.x.shape[1]
-    A, B = grounded.system.linearise(own.x, received(grounded, own.u), grounded.p, grounded.dt)
-    R = np.diag(grounded.input_weight + grounded.change_weight)
-    Q = grounded.state_weight[:, :n]
-    V, found = np.diag(Q[-1]), np.empty((len(A), n))
-    for t in range(len(A) - 1, -1, -1):
-        found[t] = np.diag(V)
-        K = -np.linalg.lstsq(R + B[t].T @ V @ B[t], B[t].T @ V @ A[t], rcond=None)[0]
-        closed = A[t] + B[t] @ K
-        V = np.diag(Q[t]) + K.T @ R @ K + closed.T @ V @ closed
-    return found
+    # what the laws of the whole run leave, in units of each trial's distance from the incumbent's
+    left = (y - np.einsum("tnq,jtq->jtn", made, d)) / far[:, None, None]
+    both = own.x.shape[1] + own.u.shape[1]
+    d = d[:, :, :both] / far[:, None, None]
+    scale = np.sqrt(np.mean(d**2, axis=(0, 1))) + 1e-12
+    d, weight = d / scale, (far / far[0]) ** -2.0
+    M = np.einsum("j,jtp,jtq->tpq", weight, d, d)
+    N = np.einsum("j,jtp,jtk->tpk", weight, d, left)
+    E = np.linalg.solve(M + PRICE_BY_STEP * np.eye(both), N) / scale[:, None]
+    made[:, :, :both] += E.transpose(0, 2, 1)
+    return made

@@ -26,7 +26,7 @@ from grounded.search.feedback import worse_costs
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import propose
 from grounded.search.making import damped, direction
-from grounded.search.mispredictions import PRICES, Seen, Told, believed, seen, shared
+from grounded.search.mispredictions import PRICES, Seen, believed, laws_by_step, seen, shared
 from grounded.search.planner import Planner, model_fingerprint, planner_with, predicted
 from grounded.search.step_size import SearchOptions
 from grounded.solve.bias import ground
@@ -353,11 +353,12 @@ def turning(own: Seen, count: int) -> tuple[np.ndarray, list[Seen]]:
     return E, others
 
 
-def test_slopes_that_change_along_the_run_are_found(grounded):
+def test_slopes_that_change_along_the_run_are_found(grounded, monkeypatch):
+    monkeypatch.setattr("grounded.search.mispredictions.PRICE_BY_STEP", PRICES[0])
     _, best, problem = grounded
     own = seen(Planner(TASK, TASK), best, problem)
     E, others = turning(own, 8)
-    law = Told.by(others, own, problem).law(PRICES[0])
+    law = laws_by_step(others, own, problem)
     q = E.shape[2]
     assert np.abs(law[:, :, :q] - E).max() < 0.1 * np.abs(E).max()
 
@@ -367,8 +368,8 @@ def test_runs_together_are_those_one_by_one_in_a_fraction_of_the_steps(grounded,
     _, best, problem = grounded
     own = seen(Planner(TASK, TASK), best, problem)
     _, others = turning(own, 3)
-    told = Told.by(others, own, problem)
-    corrected = Corrected(problem.system, told.law(0.1), own.x, own.u, own.before)
+    law = laws_by_step(others, own, problem)
+    corrected = Corrected(problem.system, law, own.x, own.u, own.before)
     late = replace(corrected.on(problem), age=age)
     policy, steps = best.candidate.policy, []
     tried = [
