@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from grounded.figures.figure import Figure, curve, panel
-from grounded.frozen import Array, white_noise
+from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
@@ -67,11 +67,6 @@ class Candidate(Result):
         return Trial(
             self.predicted_states, self.predicted_inputs, made.dt, *names, start_inputs=made.past
         )
-
-    @cached_property
-    def shown_noise(self) -> Array:
-        """The white noise (std) of the states in the predicted run, (n,), see `white_noise`."""
-        return white_noise(self.predicted_states)
 
     @property
     def grounded(self) -> bool:
@@ -170,7 +165,7 @@ class Tried(Result):
     in_doubt: bool = False  # undecided because the best one is to be run again
     pieces: Array | None = None  # (runs, PIECES) parts of the utilities of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
-    noise_missed: float = 0.0  # of sensor noise, which its prediction lacks, by `known_noise`
+    noise_missed: float = 0.0  # of sensor noise, which its prediction lacks
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`Repeats`)
     probability: float = float("nan")  # that it beats the best before it; NaN: nothing is repeated
     unsure: bool = False  # runs may differ by as much as it gained (`Difference.sure`)

@@ -37,7 +37,7 @@ from grounded.frozen import Array
 from grounded.places import true_values
 from grounded.policy import Policy
 from grounded.search.candidate import DOUBTFUL_GAIN, IMPROVED, Candidate, Tried
-from grounded.search.noise import known_noise, noise_cost, noise_missed, sensor_noise
+from grounded.search.noise import noise_cost, noise_missed, sensor_noise
 from grounded.search.planner import Planner, predicted
 from grounded.task import Task
 from grounded.trial import Trial, scattered
@@ -364,14 +364,14 @@ def judged(
 
 def _told(task: Task, history: Sequence[Tried], trials: Sequence[Trial]) -> tuple[Tried, ...]:
     """Return the candidates with the noise in their logs, their scatter, and how sure gains are."""
-    pool, now, n = Repeats(history), sensor_noise(trials, task.model.n), task.model.n
+    pool, noise = Repeats(history), sensor_noise(trials, task.model.n)
     found, best = list[Tried](), None
     for tried in history:
         made = tried.candidate
         tried = replace(
             tried,
-            noise_missed=noise_missed(task, made, known_noise(trials, made, n)),
-            noise_cost=noise_cost(task, made.policy, now) if tried.trials else 0.0,
+            noise_missed=noise_missed(task, made, noise),
+            noise_cost=noise_cost(task, made.policy, noise) if tried.trials else 0.0,
             deviation=math.sqrt(pool.near(tried.utility).variance),
         )
         found.append(with_chance(tried, best, history, pool))

@@ -62,7 +62,7 @@ from grounded.trial import mean_trial
 
 PRICES = (1e-4, 1e-3, 1e-2, 0.1, 1.0, 10.0)  # ridge penalties
 FADING = (0.0, 2.0)  # the weight of a trial is its distance to minus this power
-PRICE_BY_STEP = 0.3  # the same for the laws of single steps
+PRICE_BY_STEP = 0.03  # the same for the laws of single steps
 PARTS = 8  # parts of the run for cross-validation
 NEAREST = 12  # nearest trials that are used
 ASKED = 3  # nearest trials that are left out in turn

@@ -1,8 +1,7 @@
 """Noise of the sensors, estimated from trials, and what it costs in utility.
 
 Sensor noise lowers every utility, since logged states are judged (`noise_cost`). A model that has
-seen no trial predicts a run without it; one that replays the mean of a candidate's trials predicts
-a run with the noise of that mean, which is less than that of a log (`noise_missed`).
+seen no trial predicts a run without it (`noise_missed`).
 """
 
 from __future__ import annotations
@@ -71,23 +70,6 @@ def sensor_noise(trials: Sequence[Trial], n: int) -> Array:
     return median(np.minimum(each, HUGE)) if each else np.zeros(n)
 
 
-def known_noise(trials: Sequence[Trial], made: Candidate, n: int) -> Array:
-    """Return the noise by the trials that were known when a candidate was made, (n,).
-
-    If there were none, by those up to its first run. What a candidate promises stays as it was.
-
-    Args:
-        trials: all trials, in order of storage.
-        made: the candidate.
-        n: number of states.
-    """
-    last = max((k for k, one in enumerate(trials) if one.id in made.seen), default=-1)
-    if last < 0:
-        ran = (k for k, one in enumerate(trials) if one.candidate == made.id)
-        last = max(0, next(ran, len(trials)) - 1)
-    return sensor_noise(trials[: last + 1], n)
-
-
 def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
     """Return the mean loss of utility of a logged run due to sensor noise; >= 0.
 
@@ -111,18 +93,13 @@ def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
 def noise_missed(task: Task, made: Candidate, noise: Array) -> float:
     """Return how much of the cost of sensor noise in a log a candidate's prediction lacks; >= 0.
 
-    All of it, if the model that predicted it replays no trial. Otherwise the bias of that model
-    contains the noise of the trials that it replays, and the predicted run shows it: as much as a
-    log after a single run, of which nothing must be added twice, and 1 / sqrt(N) of it after N runs
-    whose mean is replayed. How much it shows is measured as in the logs, with the same estimate, as
-    a step may also have smoothed it.
+    All of it, if the model that predicted it replays no trial. Otherwise its bias contains the
+    noise of the trial that it replays, and the predicted run shows it.
 
     Args:
         task: its reward judges the log.
         made: the candidate.
         noise: standard deviations of the sensors' white noise, (n,), in the states' units.
     """
-    shown = made.shown_noise if made.grounded else np.zeros_like(noise)
-    least = noise_cost(task, made.policy, noise) + made.predicted_utility
-    missed = noise_cost(task, made.policy, np.sqrt(np.maximum(noise**2 - shown**2, 0.0)))
-    return max(missed, least)
+    whole = noise_cost(task, made.policy, noise)
+    return max(0.0 if made.grounded else whole, whole + made.predicted_utility)

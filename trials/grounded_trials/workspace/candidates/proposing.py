@@ -11,7 +11,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, found, settle
 from grounded.result import Result
 from grounded.search.difference import in_question, last_gain
-from grounded.search.noise import known_noise, noise_cost, noise_missed
+from grounded.search.noise import noise_cost, noise_missed, sensor_noise
 from grounded.search.standing import Phase
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.candidates import trust
@@ -197,7 +197,7 @@ def _told(
     made, now, task = proposal.candidate, proposal.standing, workspace.task
     assert made is not None
     same = [t for t in now.history if t.candidate.id == made.id]
-    noise = known_noise(workspace.task_trials(), made, workspace.base_model.n)
+    noise = sensor_noise(workspace.task_trials(), workspace.base_model.n)
     cost = same[0].noise_missed if same else noise_missed(task, made, noise)
     whole = noise_cost(task, made.policy, noise)
     ahead = off_target_of(task, [made.predicted_run])
