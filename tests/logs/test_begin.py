@@ -21,7 +21,6 @@ from ros_bags import (
     arm_bag,
     boat_bag,
     car_bag,
-    thruster_bag,
 )
 from shared_data import data
 
@@ -205,13 +204,6 @@ def test_a_boat_with_two_thrusters_is_no_drone(tmp_path):
     x = model.system.step(np.zeros((1, 6)), np.array([[0.0, 1.0]]), model.values, 0.01)[0]
     moved = dict(zip(model.states, x, strict=True))
     assert moved["u"] > 0 and moved["r"] > 0  # the right thruster alone turns it to the left
-
-
-def test_two_thrusters_in_an_unnamed_array_are_offered(tmp_path):
-    found = begin(tmp_path / "w", thruster_bag(tmp_path / "bag"))
-    assert found.kind == "boat" and {one.name for one in found.unsure} == {"left", "right"}
-    both = {f"/thrusters/cmd.data[{k}]" for k in (0, 1)}
-    assert all({*one.others} == both for one in found.inputs)
 
 
 @pytest.mark.parametrize(

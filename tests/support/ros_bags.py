@@ -191,9 +191,9 @@ def arm_bag(folder, scale=1.0):
     return bag(folder, topics, messages)
 
 
-def commanded_arm_bag(folder, order=("shoulder", "elbow"), measured_torques=False):
+def commanded_arm_bag(folder, measured_torques=False):
     """Write a bag of a vertical arm: JointState in alphabetical order, commands without names."""
-    rng, own, h = np.random.default_rng(0), ("shoulder", "elbow"), 0.002
+    rng, h = np.random.default_rng(0), 0.002
     topics = {
         "/joint_states": "sensor_msgs/msg/JointState",
         "/effort_controller/commands": "std_msgs/msg/Float64MultiArray",
@@ -214,8 +214,7 @@ def commanded_arm_bag(folder, order=("shoulder", "elbow"), measured_torques=Fals
         if k % 10 == 0:
             near = near + 0.05 * (goal - near)
             u = [16, 4] * (near - measured[0]) - [2.5, 0.35] * measured[1]
-            sent = np.array([u[own.index(name)] for name in order])
-            message = T["std_msgs/msg/Float64MultiArray"](layout=layout, data=sent)
+            message = T["std_msgs/msg/Float64MultiArray"](layout=layout, data=np.array(u))
             messages.append(("/effort_controller/commands", t + 10**6, message))
         w = w + h * _arm_acceleration(q, w, u)
         q = q + h * w
@@ -259,37 +258,4 @@ def crane_bag(folder, joint="trolley"):
             a = (push + swings) / (6.0 + 2.0 * np.sin(th) ** 2)
             x, v = x + DT / 5 * v, v + DT / 5 * a
             th, w = th + DT / 5 * w, w - DT / 5 * (a * np.cos(th) + 9.81 * np.sin(th)) / 0.85
-    return bag(folder, topics, messages)
-
-
-def thruster_bag(folder):
-    """Write a bag of a boat whose two thrusters lag by 0.2 s, the right one first in an array."""
-    rng, h = np.random.default_rng(3), 0.02
-    array = T["std_msgs/msg/Float64MultiArray"]
-    layout = T["std_msgs/msg/MultiArrayLayout"](dim=[], data_offset=0)
-    topics = {
-        "/odom": "nav_msgs/msg/Odometry",
-        "/thrusters/cmd": "std_msgs/msg/Float64MultiArray",
-    }
-    messages, (x, y, psi, u, v, r) = [], np.zeros(6)
-    felt, sent = np.zeros(2), np.zeros(2)
-    for k in range(3000):
-        t = START + k * 20_000_000
-        if k % 60 == 0:
-            sent = rng.uniform(-0.6, 1.0, 2)
-        if k % 5 == 0:
-            told = array(layout=layout, data=sent[::-1].copy())
-            messages.append(("/thrusters/cmd", t, told))
-        seen = np.array([x, y, psi, u, r]) + rng.normal(0, [8e-3, 8e-3, 4e-3, 0.015, 6e-3])
-        pose = odometry(t, *seen)
-        pose.twist.twist.linear.y = v + 0.015 * rng.normal()
-        messages.append(("/odom", t, pose))
-        felt += h / 0.2 * (np.where(np.abs(sent) > 0.06, sent, 0.0) - felt)
-        push = np.where(felt > 0, 20.0, 12.0) * felt * [1.0, 0.92]
-        u += h * (push.sum() + 24 * v * r - 3 * u - 6.5 * u * abs(u)) / 16.5
-        v += h * (-16.5 * u * r - 8 * v - 45 * v * abs(v)) / 24
-        r += h * (0.2 * (push[1] - push[0]) - 7.5 * u * v - 1.2 * r - 1.5 * r * abs(r)) / 2.5
-        psi += h * r
-        x += h * (u * np.cos(psi) - v * np.sin(psi))
-        y += h * (u * np.sin(psi) + v * np.cos(psi))
     return bag(folder, topics, messages)

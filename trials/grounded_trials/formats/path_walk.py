@@ -63,6 +63,11 @@ class Found:
 def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
     """Evaluate a path on messages.
 
+    Args:
+        part: the messages.
+        path: the path.
+        stamps: whether to read the time stamps too; only numbers with one are then returned.
+
     Raises:
         BadMessage: for a stamp outside the calendar.
         BadPath: if a message has no number at the end of the path, suggesting the nearest name.

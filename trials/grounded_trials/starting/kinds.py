@@ -215,12 +215,9 @@ class Clues:
 
     @property
     def afloat(self) -> str:
-        """The topic of a boat, and its two thrusters, which may be an array without names."""
-        afloat = [t for t in self.log.topics if AFLOAT.search(t.topic.lower())]
-        arrays = ([f.path for f in t.fields if f.low != f.high] for t in afloat * self.headed)
-        two = (a for a in arrays if len(a) == 2 and all(path.endswith("]") for path in a))
-        both = self.sides or tuple(next(two, ()))
-        return ", ".join((afloat[0].topic, *both)) if afloat and both else ""
+        """The topic of a boat, and its two thrusters."""
+        topic = self.topic(AFLOAT) if self.sides else ""
+        return ", ".join((topic, *self.sides)) if topic else ""
 
     @property
     def flat(self) -> str:

@@ -96,6 +96,10 @@ class Notes:
     def add(self, note: Mapping[str, str], *, again: bool = True) -> None:
         """Add a note.
 
+        Args:
+            note: its contents.
+            again: add it even if an equal note exists.
+
         Raises:
             GroundedError: if it can't be written.
         """

@@ -50,7 +50,14 @@ def mapping_toml(
     simulated: bool = False,
     layout: Layout = AS_IT_SAYS,
 ) -> str:
-    """Format guesses as a [log] table, with comments where a person should check."""
+    """Format guesses as a [log] table, with comments where a person should check.
+
+    Args:
+        states: one guess for each state.
+        inputs: one guess for each input.
+        simulated: whether header stamps are on another clock than the log.
+        layout: what the log's table does not say.
+    """
     clock = "log" if simulated else "header"
     lines = ["[log]", f'clock = "{clock}"']
     if simulated:

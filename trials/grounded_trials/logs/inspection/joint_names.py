@@ -133,6 +133,11 @@ def in_order(
     """Return the numbers of each state and input in order from the base, if none has a name.
 
     There must be as many of a unit as joints. Prismatic joints have states in m, revolute in rad.
+
+    Args:
+        roles: the unit of each state and input without a matching name, and whether it is sent.
+        joints: see `joint_names`.
+        log: an inspected log.
     """
     if len(joints) != 1:
         return {}

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations
 
@@ -15,7 +16,8 @@ from grounded.errors import GroundedError
 from grounded_trials.formats.messages import Floats
 from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.samples import Samples, tidy, unwound
-from grounded_trials.logs.signals import SignalSpec, read_signals
+from grounded_trials.logs.signals import Series, SignalSpec, read_signals
+from grounded_trials.within import OverBudget
 
 FOLLOWS, SURELY = 0.8, 0.95  # correlation of a rate with a derivative: named so, or not
 SAME = 0.15  # relative tolerance of the size of a rate
@@ -80,7 +82,15 @@ class Signals:
         more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
         clocks = {p: self.log.clock(self.log.topic_of(p)) for p in more}
         specs = {p: SignalSpec(p, clock=clock) for p, clock in clocks.items()}  # type: ignore[arg-type]
-        series = read_signals(self.log.files, specs, self.log.layout) if specs else {}
+        series: dict[str, Series] = {}
+        try:
+            series = read_signals(self.log.files, specs, self.log.layout) if specs else {}
+        except OverBudget:
+            raise
+        except GroundedError:  # for one of them, which has a text in some messages
+            for path, spec in specs.items():
+                with suppress(GroundedError):
+                    series |= read_signals(self.log.files, {path: spec}, self.log.layout)
         for path, one in series.items():
             try:
                 found = tidy(path, one, unwrap="@rpy" in path)
