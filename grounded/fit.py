@@ -258,7 +258,7 @@ class _Ended:
         """Each fitted delay [s] and parameter: value, standard deviation, half of its interval."""
         data, h = self.search.data, self.best.hypothesis
         late = [(name, float(data.latency[inputs[0]])) for name, inputs in self.delayed.items()]
-        told, sure = {}, self.search.sure(self.best)
+        told, sure = {}, self.search.sure(self.best, thresholds=True)
         for k, (one, std, half) in enumerate(zip(values_of(h, data), *sure, strict=True)):
             name, start = late[k] if one.effect else (one.quantity, 0.0)
             told[name] = start + one.value, float(std) * one.scale, float(half) * one.scale

@@ -48,7 +48,7 @@ class FittedHypotheses:
         self.candidates = tuple(candidates)
         self.N = max(data.steps, 2)
         self._cancelling: dict[object, bool] = {}
-        self._sure: dict[tuple[int, float], tuple[Fitted, tuple[Array, Array]]] = {}
+        self._sure: dict[tuple[int, float, bool], tuple[Fitted, tuple[Array, Array]]] = {}
         self.tempering = Tempering()
         self._prices: dict[tuple[object, ...], float] = {}
         self.fits: dict[tuple[Structure, float, tuple[str, ...]], Fitted] = {}
@@ -119,11 +119,16 @@ class FittedHypotheses:
         bare = (f for (_, spread, names), f in self.fits.items() if not names and spread == 0)
         return max(bare, key=self.score)
 
-    def sure(self, fit: Fitted) -> tuple[Array, Array]:
-        """Return each unknown's standard deviation and half-width of its 95 % interval, (C,)."""
-        key = id(fit), self.tempering.factor
+    def sure(self, fit: Fitted, *, thresholds: bool = False) -> tuple[Array, Array]:
+        """Return each unknown's standard deviation and half-width of its 95 % interval, (C,).
+
+        thresholds: see `standard_deviations`; of parameters, so effects' values need none.
+        """
+        key = id(fit), self.tempering.factor, thresholds
         if key not in self._sure:
-            found = standard_deviations(self.predictor, fit, self.data.folds, key[1])
+            found = standard_deviations(
+                self.predictor, fit, self.data.folds, key[1], thresholds_too=thresholds
+            )
             self._sure[key] = fit, found
         return self._sure[key][1]
 

@@ -49,7 +49,12 @@ LEFT_WITHOUT_STRETCH = 0.2
 
 
 def standard_deviations(
-    predictor: Predictor, fit: Fitted, trial_of: Array, worth: float = 1.0
+    predictor: Predictor,
+    fit: Fitted,
+    trial_of: Array,
+    worth: float = 1.0,
+    *,
+    thresholds_too: bool = False,
 ) -> tuple[Array, Array]:
     """Return each unknown's standard deviation and half-width of its 95 % interval, (C,) each.
 
@@ -59,6 +64,8 @@ def standard_deviations(
         trial_of: the group that each run is left out with, usually its trial (B,).
         worth: what a nat is worth, below 1 if innovations are correlated: the same samples then
             hold less information (`grounded.filter.tempering`).
+        thresholds_too: follow the likelihood of parameters that have no slope, which takes some
+            tens of predictions each; else theirs are those of their secants.
     """
     if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
@@ -71,7 +78,7 @@ def standard_deviations(
             scatter = np.sqrt((len(some) - 1) * some.var(axis=0))
             std = np.maximum(std, scatter)
             half = np.maximum(half, _student(len(some) - 1) * scatter)
-    for j in thresholds(predictor, fit):
+    for j in thresholds(predictor, fit) if thresholds_too else ():
         half[j] = np.abs(level(predictor, fit, j, DROP / worth)).max()
         std[j] = half[j] / NORMAL
     smeared = np.hypot(

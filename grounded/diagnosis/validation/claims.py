@@ -164,9 +164,10 @@ class Claims:
     def _calibrated(self) -> list[tuple[str, float, float, float]]:
         """The calibrated parameters by the fit: name, value, standard deviation, half-width."""
         values = values_of(self.best.hypothesis, self.data)
+        sure = self.search.sure(self.best, thresholds=True)
         return [
             (one.quantity, one.value, float(std) * one.scale, float(half) * one.scale)
-            for one, std, half in zip(values, *self.search.sure(self.best), strict=True)
+            for one, std, half in zip(values, *sure, strict=True)
             if not one.effect
         ]
 
