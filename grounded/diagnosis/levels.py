@@ -11,7 +11,7 @@ NATS = 3.0  # from which one explanation is preferred; within it two tie ("Decid
 PICKED = 5.0  # of what was picked among many: a cause, a leftover, a changed value ("Decide")
 
 # standard errors, and chance
-ERRORS = 1.0  # by which one prediction is better than another ("Decide")
+ERRORS = 0.9  # by which one prediction is better than another ("Decide")
 SURE = 2.0  # from which a value differs from zero, or a prediction is clearly better ("Decide")
 MANY = 3.0  # the same for the most striking of many: channels, trials, regions ("Leftover")
 CHANCE = 1e-3  # p-value below which trials disagree, or noise is not white ("Values")

@@ -4,9 +4,10 @@ Search proposes, this rule claims. Every set of causes that was fitted is an `Op
 where its values were not fitted (`ruler`, by group of trials). The rule has four steps:
 
     1. A set is *supported* if it is better than without any one of its causes. *Better* is a set
-       whose predictions are better by more than their standard error and, if it is larger, that
-       is likelier (PICKED nats). A cause that a guard refuses is not supported, nor one that gains
-       less than matters (LEAST, and SHARE of what the set gains).
+       whose predictions are better by ERRORS of their standard error and, if it is larger, that is
+       likelier (PICKED nats). If it is as small, it may be less likely by as much only if its
+       predictions are clearly better, and by SHOWS. A cause that a guard refuses is not supported,
+       nor one that gains less than matters (LEAST, and SHARE of what the set gains).
     2. The *reference* is the supported set that predicts best.
     3. Of the supported sets that the reference is not better than, the smallest is chosen: the
        one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
@@ -27,7 +28,8 @@ its standard error. Each trial's errors are damped by the mean error,
 
 so that none dominates: where a cause does not act it adds neither gain nor scatter. Trials are few
 and differ in how much of a cause they contain, so that even a large one may gain little more than
-the standard error. So no more is asked of predictions, and more of the evidence.
+the standard error: what one of many trials gains is just one. So a little less than that is asked
+of predictions, and more of the evidence.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ from typing import Any
 import numpy as np
 
 from grounded.diagnosis.error_report import CALIBRATION
-from grounded.diagnosis.levels import ERRORS, LEAST, NATS, PICKED, SHARE, SURE
+from grounded.diagnosis.levels import ERRORS, LEAST, NATS, PICKED, SHARE, SHOWS, SURE
 from grounded.frozen import Array
 
 
@@ -149,10 +151,14 @@ class Rule:
         self._unsupported[option.causes] = causes
 
     def better(self, before: Option, after: Option) -> bool:
-        """Check whether one set predicts better than another and, if it is larger, is likelier."""
+        """Check whether one set predicts better than another, and evidence does not contradict."""
         if after.size > before.size and not self.nats(before, after) >= PICKED:  # also of none
             return False
-        return not self.held_out or self.gain(before.errors, after.errors).pays
+        if not self.held_out:
+            return True
+        gain = self.gain(before.errors, after.errors)
+        beyond_doubt = gain.clear and gain.mean > SHOWS
+        return beyond_doubt or (gain.pays and self.nats(before, after) > -PICKED)
 
     def _needed(self, option: Option, cause: str) -> bool:
         less = self.less(option, cause)
@@ -198,7 +204,7 @@ class Gain:
 
     @property
     def pays(self) -> bool:
-        """Whether predictions are better. What one of many trials gains is one standard error."""
+        """Whether predictions are better, by a little less than what one of many trials gains."""
         return self._by(ERRORS)
 
     def _by(self, errors: float) -> bool:

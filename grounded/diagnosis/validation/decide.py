@@ -8,8 +8,6 @@ set that one of their causes less makes, are measured by the `ruler`; `choose` p
 
 A guard refuses a cause whatever it gains:
 
-    cut        beside it, a parameter of the model ends at a bound at which it is not without it:
-               the bound decides how large the cause is
     no size    none of its values differs from zero by SURE standard deviations
     one group  only one of several groups of trials shows it, or all trials are of one group and
                it names no mechanism (`Family.loose`)
@@ -243,12 +241,10 @@ class Options:
         Otherwise the cause would be credited with what better values of the others gain. None if
         the rest can't be filtered, or if a guard refuses the cause.
         """
-        fit, search = self.fits[option.causes], self.search
         own = self._fitted_without(option.causes, cause)
         if own is None or cause in self.vague_alone(option.causes):
             return None
-        cut = {*stopped(search, fit)} - {*stopped(search, self.fits[own])}
-        if cause != CALIBRATION and (cut or one_group(search, fit, cause)):
+        if cause != CALIBRATION and one_group(self.search, self.fits[option.causes], cause):
             return None
         return self.option(own)
 
@@ -265,14 +261,6 @@ class Options:
             self.search.refined([(fit.hypothesis, likeliest.noise, fit.track)], REFIT)
             known = self._of(after.causes)
         return self.search.score(known[0]) - self.search.score(likeliest)
-
-
-def stopped(search: HypothesisSearch, fit: Fitted) -> list[str]:
-    """Return the model's parameters that a fit leaves at a bound."""
-    model, shift = search.data.model, fit.hypothesis.shift
-    values = model.values if shift is None else model.values + shift
-    params = zip(model.params.items(), values, strict=True)
-    return [name for (name, param), value in params if param.stopped(float(value))]
 
 
 def one_group(search: HypothesisSearch, fit: Fitted, name: str) -> tuple[int, ...]:
