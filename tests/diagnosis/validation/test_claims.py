@@ -60,8 +60,8 @@ DRAG, BIAS = option("drag", 80.0, 0.3), option("bias", 30.0, 0.8)
         ([NONE, DRAG], "drag"),
         ([NONE, option("drag", 2.0, 0.3)], ""),  # predicts well by chance
         ([NONE, option("drag", 80.0, 1.0)], ""),  # likely, and of no use
-        ([NONE, option("drag", 80.0, [0.1, *[1.1] * 5])], ""),  # in one trial, and against others
-        ([NONE, option("drag", 80.0, 0.3), option("lag", 90.0, 0.28)], "lag"),  # better and likelier
+        ([NONE, option("drag", 80.0, [0.1, *[1.1] * 5])], ""),  # one trial gains, others lose
+        ([NONE, option("drag", 80.0, 0.3), option("lag", 90.0, 0.28)], "lag"),  # and likelier
         ([NONE, option("drag", 80.0, 0.3), option("lag", 70.0, 0.28)], "drag"),  # a little better
         ([NONE, DRAG, BIAS, option("bias drag", 110.0, 0.1)], "bias drag"),
         ([NONE, DRAG, BIAS, option("bias drag", 81.0, 0.1)], "drag"),  # one is not needed
