@@ -163,7 +163,6 @@ class Tried(Result):
     utilities: tuple[float, ...]
     accepted: bool | None  # None: undecided, trials are missing
     in_doubt: bool = False  # undecided because the best one is to be run again
-    pieces: Array | None = None  # (runs, PIECES) parts of the utilities of repeats
     noise_cost: float = 0.0  # cost of sensor noise in its logs
     noise_missed: float = 0.0  # of sensor noise, which its prediction lacks
     deviation: float = float("nan")  # standard deviation of a single run, from repeats (`Repeats`)

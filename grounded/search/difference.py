@@ -5,20 +5,9 @@ Every part that compares two utilities asks it: the verdicts and the end of the 
 utility gives the probability. While nothing was repeated, costs are taken to scatter as chi-squared
 with eight degrees of freedom.
 
-Two runs may have nearly equal utilities by chance, and few candidates are run more than twice. So
-the variance of a run is estimated from pooled data (`Repeats`):
-
-    over candidates   all repeated candidates of about the same cost: the scatter of a poor policy
-                      says nothing about that of a good one
-    within runs       a utility is the sum over PIECES parts of the run. Two sums may agree by
-                      chance, but hardly all of their parts. With A the variance of the utilities
-                      and B the sum of the variances of the parts: (nu A + mu B) / (nu + mu)
-
-nu is the number of repeats. mu is the additional information of the parts: the effective degrees of
-freedom of B (Satterthwaite, "An approximate distribution of estimates of variance components",
-Biometrics Bulletin 2, 1946), less nu, and at most PIECES - 1, so that many repeats outweigh the
-assumption that the parts are independent. This is a conjugate prior on the variance (Gelman et al.,
-*Bayesian Data Analysis*, 2013, section 2.6); Student's t has nu + mu degrees of freedom.
+Few candidates are run more than twice. So the variance of a run is pooled (`Repeats`) over all
+repeated candidates of about the same cost: the scatter of a poor policy says nothing about that of
+a good one.
 """
 
 from __future__ import annotations
@@ -45,7 +34,6 @@ from grounded.trial import Trial, scattered
 if TYPE_CHECKING:
     from grounded.search.step_size import SearchOptions
 
-PIECES = 4  # parts of a run
 LARGEST_COST_RATIO = 2.0  # largest ratio of costs of candidates whose scatter is pooled
 LUCK = 2.0  # standard errors that a loss must exceed to break a promise
 SHOWN = 1.645  # standard errors of a gain that is one with probability IMPROVED, 0.95
@@ -67,47 +55,31 @@ class Scatter:
         return math.sqrt(self.variance / runs)
 
 
-def by_pieces(task: Task, trials: Sequence[Trial]) -> Array:
-    """Return the utility of each part of each run, (runs, PIECES); rows sum to the utilities."""
-    worth = [task.rewards(trial) for trial in trials]
-    return np.array([[part.sum() for part in np.array_split(r, PIECES)] for r in worth])
-
-
 class Repeats:
     """The candidates that were run repeatedly, with their costs and sums of squares."""
 
     def __init__(self, history: Iterable[Tried]) -> None:
         rows = [_sums(t) for t in history if len(t.utilities) > 1 and math.isfinite(t.utility)]
-        if any(row[2:].any() for row in rows):  # then identical runs must be copies
-            rows = [row for row in rows if row[2:].any()]
-        self.rows = np.array(rows).reshape(len(rows), 3 + PIECES)
+        if any(total for *_, total in rows):  # then identical runs must be copies
+            rows = [row for row in rows if row[2]]
+        self.rows = np.array(rows).reshape(len(rows), 3)
 
     def near(self, utility: float) -> Scatter:
         """Return the scatter of runs of about this utility; none if all repeats agree exactly."""
-        cost, each = abs(utility), np.abs(self.rows[:, 0])
-        exact = not self.rows[:, 2:].any()  # then no run scatters, at whatever utility
-        some = self.rows[
-            exact | ((each <= LARGEST_COST_RATIO * cost) & (cost <= LARGEST_COST_RATIO * each))
-        ]
-        nu, total = float(some[:, 1].sum()), float(some[:, 2].sum())
-        parts = some[:, 3:].sum(axis=0)
-        if not (nu and math.isfinite(total + parts.sum())):
-            return Scatter()
-        share = parts / (parts.sum() or 1.0)
-        added = min(nu / float((share**2).sum() or 1.0) - nu, PIECES - 1.0)
-        variance = (total + added * float(parts.sum()) / nu) / (nu + added)
-        return Scatter(variance, nu + added)
+        cost, (each, freedom, squares) = abs(utility), np.abs(self.rows.T)
+        some = (each <= LARGEST_COST_RATIO * cost) & (cost <= LARGEST_COST_RATIO * each)
+        some |= not squares.any()  # then no run scatters, at whatever utility
+        nu, total = float(freedom[some].sum()), float(squares[some].sum())
+        return Scatter(total / nu, nu) if nu and math.isfinite(total) else Scatter()
 
 
-def _sums(tried: Tried) -> Array:
-    """Return the utility, degrees of freedom, sum of squares, and sums of squares of the parts."""
-    parts, total = np.zeros(PIECES), 0.0
+def _sums(tried: Tried) -> tuple[float, float, float]:
+    """Return the utility, its degrees of freedom, and the sum of squares."""
+    total, runs = 0.0, len(tried.utilities)
     if len(set(tried.utilities)) > 1:  # else exactly 0, which a rounded mean may miss
         with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
-            if tried.pieces is not None:
-                parts = ((tried.pieces - tried.pieces.mean(axis=0)) ** 2).sum(axis=0)
-            total = float(np.var(tried.utilities)) * len(tried.utilities)
-    return np.array([tried.utility, len(tried.utilities) - 1.0, total, *parts])
+            total = float(np.var(tried.utilities)) * runs
+    return tried.utility, runs - 1.0, total
 
 
 # --- what a start state costs ---------------------------------------------------------------------
@@ -337,8 +309,7 @@ def judged(
         if len(own) < enough and not failed:
             history.append(Tried(candidate, own, utilities, None, gone=gone))
             continue
-        pieces = by_pieces(task, own) if len(own) > 1 and np.isfinite(utilities).all() else None
-        tried = Tried(candidate, own, utilities, False, pieces=pieces, gone=gone)
+        tried = Tried(candidate, own, utilities, False, gone=gone)
         better = incumbent is None or tried.utility > incumbent.utility
         if better and not failed:
             tried = replace(tried, accepted=True)
