@@ -218,6 +218,10 @@ class Document(Result):
 
     ALSO: ClassVar[tuple[str, ...]] = ()
 
+    def summary(self) -> str:
+        """Return the first two fields: mostly a name, and a file."""
+        return ", ".join(str(getattr(self, one.name)) for one in fields(self)[:2])
+
     def to_json(self) -> dict[str, Any]:
         """Return the fields by JSON key."""
         found = {}

@@ -38,17 +38,13 @@ def tell_proposed(proposed: Proposed, *, details: bool = False) -> None:
         return show(field("end", standing.sentence))
     waiting = "" if proposed.proposal.is_new else " (waiting)"
     show(f"Run {candidate.id}{' once more' if proposed.again else waiting}: {proposed.file}")
-    rows = (
-        ("why", standing.sentence if proposed.again else ""),
-        ("what", proposed.made.sentence if proposed.made else ""),
-        ("predicted", proposed.predicted.sentence if proposed.predicted else ""),
-        ("off target", "; ".join(one.finding.what for one in proposed.off_target)),
-        ("so far", proposed.so_far.sentence if proposed.so_far else ""),
-        ("trust", proposed.trust.sentence if proposed.trust else ""),
-    )
-    for label, text in rows:
-        if text:
-            show(field(label, text, "  "))
+    if proposed.again:
+        show(field("why", standing.sentence, "  "))
+    for label, one in proposed.promises.items():
+        show(field(label, one.sentence, "  "))
+        if label == "predicted" and proposed.off_target:
+            off = "; ".join(error.finding.what for error in proposed.off_target)
+            show(field("off target", off, "  "))
     show_extent(proposed.extent)
 
 

@@ -48,11 +48,6 @@ def sled(tmp_path):
     return blank(tmp_path / "w", MODEL)
 
 
-def assumed(w):
-    """Notes on what the plan assumes before its start."""
-    return [n for n in Workspace(w.folder).propose().notes if "start = " in n]
-
-
 def driver(folder):
     spec = importlib.util.spec_from_file_location("drive", folder / "drive.py")
     module = importlib.util.module_from_spec(spec)
@@ -123,21 +118,11 @@ model = Model(states={"z": "m", "v": "m/s", "w": "rad/s"}, inputs={"left": "1", 
 """
 
 
-def test_what_holds_the_start_is_held_before_it_or_asked_for(tmp_path):
+def test_what_holds_the_start_is_held_before_it(tmp_path):
     w = blank(tmp_path / "w", HOVER)
     hover = (1.2 * 9.81 / 16) ** 0.5
     assert list(w.config.task.start) == ["left", "right"]
     np.testing.assert_allclose(w.task.past, hover, rtol=1e-5)
-    edit(w.folder, start="{ }")
-    (note,) = assumed(w)
-    assert "left = 0.8578, right = 0.8578" in note
-    for given in (
-        {"start": "{ }", "limits": "left = [0, 0.8]"},  # inside which nothing holds it
-        {"start": "{ left = 0.0 }"},  # somebody says so
-        {"start": "{ v = 1.0 }"},  # in motion, which no input holds
-    ):
-        edit(w.folder, **{"limits": ""} | given)
-        assert not assumed(w)
 
 
 def test_a_candidate_as_proposed_runs_like_its_export(sled, tmp_path):

@@ -36,7 +36,7 @@ LOG: dict[str, Entry] = {
         "{negative}]]",
         "[[multiply the scale in {tables} by {by:.8g} (a missing one is 1)]][[let the program "
         "write {writes}]]",
-        hides=(*JUDGED, "log.limits", "log.stated"),
+        hides=(*JUDGED, "log.limits"),
     ),
     "sign": account(
         "{about} {about:is/are} logged with the opposite sign",
@@ -82,10 +82,6 @@ LOG: dict[str, Entry] = {
     "path": warn(
         "{about} is read from {path}, {what}[[: {instead} is the angle]]", "check its path in [log]"
     ),
-    "stated": warn(
-        "{about} is read without a scale from a column in {unit}, but the model has {own}",
-        "set scale = {by:.6g} in {table}, if so",
-    ),
     "limits": warn(
         "{about} goes up to {most} beyond its [limits], {limits}",
         "{how:clip=log the commands after clipping,flip=its scale in [log] is negative: multiply "
@@ -104,11 +100,6 @@ LOG: dict[str, Entry] = {
         "start recording before the run, or ingest it with --data",
     ),
     # where a run begins
-    "from": note(
-        "it is used from {at:.3f} s on, as if {name} had been {value:.4g} before: what was sent "
-        "before the log is not in it",
-        "if {name} was 0, add a row before it that says so, or ingest it with `--before {name}=0`",
-    ),
     "start_assumed": warn(
         "no start of {ran} was found in it: the run is assumed to begin at its first command, at "
         "{at:.3f} s",

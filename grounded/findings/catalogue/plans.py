@@ -44,10 +44,8 @@ PLAN: dict[str, Entry] = {
         "predicts {model}, of which {candidate} is to gain {gain}]]",
     ),
     "tested": note(
-        "[[promised? the last prediction was {promised}]][[real? , the run gave "
-        "{real}]][[!promised? the last predictions missed the utility by {missed}]][[; "
-        "{failed:run} failed]][[; this one promises a gain of {gain}]][[less? , less than such an "
-        "error]][[noise? , which may only be the noise of the run that it replays]]",
+        "the last predictions missed the utility by {missed}[[; {failed:run} failed]][[; this one "
+        "promises a gain of {gain}]][[less? , less than such an error]]",
     ),
     "untested": note(
         "unknown: no run has tested the model[[changed?  since it was changed]][[; it can be "
@@ -58,10 +56,6 @@ PLAN: dict[str, Entry] = {
     "no_target": refuse(
         "there is no manoeuvre to learn: [task] names no target",
         "draw one with `grounded target`; `fit` and `diagnose` need none",
-    ),
-    "waits_void": refuse(
-        "{standing}, but {why}",
-        "undo what was changed, or run {candidate} regardless with --anyway",
     ),
     "not_optimal": note(
         "the plan is not optimal in the model: {why}; it can be run all the same: the steps from "
@@ -83,12 +77,6 @@ PLAN: dict[str, Entry] = {
     "limits_of_log": note(
         "[limits] are only the range used in {log}",
         "enter the robot's real limits, then delete seen_in there",
-    ),
-    "not_at_rest": warn(
-        "the plan assumes {held} before the start and after the end, under which {state} changes "
-        "at once, by {rate}",
-        "if nothing but its inputs holds the robot there, put what does into [task] of "
-        "grounded.toml: start = {start}; else just propose again",
     ),
     # it is not handed over, or not without a warning
     "refused": refuse(
@@ -209,8 +197,8 @@ SEARCH: dict[str, Entry] = {
         "another task's candidate or a probe",
     ),
     "left_out": note(
-        "{about} {about:has/have} [[other states or inputs than {model}]][[a sampling interval of "
-        "{was}, and [task] dt is {now}]]: fit, diagnose and the search leave {about:it/them} out",
+        "{about} {about:has/have} another sampling interval than [task] dt, or other states or "
+        "inputs than the model: fit, diagnose and the search leave {about:it/them} out",
     ),
     "outdated": note(
         "the last diagnosis is outdated[[; it had "

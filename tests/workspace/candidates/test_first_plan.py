@@ -86,37 +86,6 @@ def drawn(w, *words) -> None:
 
 
 @pytest.fixture
-def lifted(tmp_path):
-    """A robot that hovers at a thrust of 0.4905."""
-    w = blank(tmp_path / "w", LIFTED, limits="thrust = [0.1, 1]\nturn = [-200, 200]")
-    w.target({"h": np.linspace(1.0, 1.5, 101)})
-    return w
-
-
-def test_what_holds_the_start_is_offered_for_the_model_as_it_is(lifted):
-    def start(effects: str, given: str) -> str:
-        edit(lifted.folder, effects=effects, start=f"{{ {given} }}")
-        return "".join(str(one.facts["start"]) for one in told(lifted, "plan.not_at_rest"))
-
-    fading = '{name = "input_fade:thrust", k = 0.001}'  # which never rests
-    dead = '{name = "dead_zone:thrust", c = 0.2}'
-    given = "h = 1, thrust = 0.4905, turn = 0"
-    assert start(fading, "h = 1") == f"{{ {given} }}"
-    assert start(dead, "h = 1") == "{ h = 1, thrust = 0.6905, turn = 0 }"
-    assert start("", given) == ""
-    assert start(dead, given) == "{ h = 1, thrust = 0.6905, turn = 0 }"
-    assert start(dead, given) == ""  # once
-
-
-def test_a_plan_that_begins_from_no_input_is_not_handed_out_before_it_was_said(lifted):
-    edit(lifted.folder, start="{ h = 1 }", limits="thrust = [0, 1]\nturn = [-9, 9]", system="")
-    first = Workspace(lifted.folder).propose()
-    assert first.then.verb == "propose"
-    again = Workspace(lifted.folder).propose()  # it is right as it is
-    assert again.candidate.id == first.candidate.id and again.then.verb == "export"
-
-
-@pytest.fixture
 def plane(tmp_path):
     """A planar drone that hovers at z = 1 m."""
     limits = "thrust = [0, 1]\nturn = [-3, 3]"

@@ -159,10 +159,9 @@ def test_a_robot_that_stands_still_before_its_first_command_was_sent_nothing(tmp
     starts = {}
     for speed in (0.0, 0.4):
         path = published_when_touched(tmp_path / f"{speed}.mcap", speed)
-        found = w.ingest(path, data=True)
+        w.ingest(path, data=True)
         trial = w.trials()[-1].trial
         starts[speed] = (trial.states[0, 0], trial.start_inputs)
-        assert bool(found.notes) == (speed > 0)
     assert starts[0.0][0] == pytest.approx(0.3, abs=0.01) and starts[0.0][1] == pytest.approx([0])
     assert starts[0.4][0] > 0.6 and starts[0.4][1][0] > 0  # with its first command as that before
 

@@ -131,13 +131,7 @@ def body_in(findings: Findings) -> Body:
 
 
 def body_of(model: Model, scene: Scene, size: float) -> Body:
-    """Return the body of a model.
-
-    Args:
-        model: provides roles and parameters.
-        scene: the position and orientation of the body.
-        size: length of a vehicle.
-    """
+    """Return the body of a model."""
     own: Body | None = getattr(model.step, "body", None)  # provided by an adapter
     if own is not None:
         return own

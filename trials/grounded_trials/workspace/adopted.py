@@ -72,12 +72,7 @@ def settled(
 def in_order(
     old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Merge a model's effects with newly diagnosed ones, in the order in which they act.
-
-    Args:
-        old: the effects of the model, as in [model] effects.
-        new: the new effects, in the order of the diagnosis (`Diagnosis.joining`).
-    """
+    """Merge a model's effects with newly diagnosed ones, in the order in which they act."""
     library = installed_effects()
     both = (old, new)
     families = [[library.family(str(e["name"]).partition(":")[0]) for e in some] for some in both]

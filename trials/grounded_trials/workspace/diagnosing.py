@@ -285,12 +285,7 @@ def near(task: Task, n: int, trials: Sequence[Trial]) -> Task:
 
 
 def _narrower(task: Task, strays: Array) -> Task | None:
-    """Narrow [safety] by how far runs have strayed; return None if nothing is left.
-
-    Args:
-        task: the task; states beyond `strays` (the memory of effects) keep their bounds.
-        strays: the margin, in the states' units, (n,).
-    """
+    """Narrow [safety] by how far runs have strayed; return None if nothing is left."""
     room = np.append(strays, np.zeros(task.model.n - len(strays)))
     assert task.safety_low is not None and task.safety_high is not None
     low, high = task.safety_low + room, task.safety_high - room

@@ -29,38 +29,20 @@ LENGTHS = (5.0, 10.0, 20.0, 40.0)  # [s] that are tried until no parameter stays
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Excited(Document):
-    """The result of `excite`: a drive, and what its log will tell.
+    """The result of `excite`: a drive, and what its log will tell."""
 
-    Args:
-        candidate: the drive as a candidate, which `run`, `export` and `ingest` take.
-        file: its file.
-        seconds: its duration.
-        pattern: "multisine" or "staircase".
-        frequencies_hz: the slowest and the quickest of it.
-        size: the share of the inputs' range that it uses.
-        feedback: whether states are fed back.
-        parameters: of each uncertain parameter, its value with the +- that is known, and the +-
-            that a fit of the drive's log leaves at best.
-        findings: what to know before it runs.
-        drive: how it was made.
-        then: the command to type next.
-    """
-
-    candidate: str
+    candidate: str  # that `run`, `export` and `ingest` take
     file: Path
     seconds: float
-    pattern: str
-    frequencies_hz: tuple[float, float]
-    size: float
+    pattern: str  # "multisine" or "staircase"
+    frequencies_hz: tuple[float, float]  # the slowest and the quickest of it
+    size: float  # the share of the inputs' range that it uses
     feedback: bool
+    # of each uncertain parameter its value with the +- now, and the +- that a fit leaves at best
     parameters: Mapping[str, Mapping[str, Any]]
-    findings: tuple[Finding, ...]
+    findings: tuple[Finding, ...]  # what to know before it runs
     drive: Drive = field(metadata=UNSAID)
     then: NextCommand = field(metadata=UNSAID)
-
-    def summary(self) -> str:
-        """Return the candidate and its file."""
-        return f"{self.candidate}: {self.file}"
 
 
 def excite_in(workspace: Folder, seconds: float | None = None) -> Excited:

@@ -62,11 +62,7 @@ class Contents:
 
 
 class Folder:
-    """The files of a workspace, read lazily.
-
-    Args:
-        folder: the workspace; `read_config` raises if it is none.
-    """
+    """The files of a workspace, read lazily."""
 
     def __init__(self, folder: str | Path) -> None:
         self.folder = Path(folder)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -167,10 +166,6 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
 def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     """Decode a candidate and its metadata from the bytes of its file.
 
-    Args:
-        data: the contents of the file.
-        identity: the name of the file, c0001; the candidate must have this id.
-
     Raises:
         GroundedError: if the file is damaged, rewritten, or another candidate's.
     """
@@ -198,12 +193,7 @@ def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
 
 
 def other_task(task: Task, made: Candidate) -> str:
-    """Return in what a task differs from that of a candidate, as far as the candidate shows it.
-
-    Args:
-        task: the present task.
-        made: a candidate of another one.
-    """
+    """Return in what a task differs from that of a candidate, as far as the candidate shows it."""
     policy, model = made.policy, task.model
     if (policy.state_names, policy.input_names) != (model.state_names, model.input_names):
         return "another model"
@@ -227,9 +217,6 @@ def unsure_times(stored: Iterable[StoredTrial], trials: Collection[str]) -> tupl
     return max(rows, default=0.0), max(early, default=0.0)
 
 
-_SHORT = re.compile(r"[ct]?0*(\d{1,9})", re.IGNORECASE)  # t2, T0002 or 2
-
-
 def unknown_trial(workspace: Folder, name: str) -> GroundedError:
     """Return the error for a name that is no stored trial, or that of one that is set aside."""
     given, aside = name.lower(), workspace.discarded()
@@ -245,21 +232,13 @@ def unknown_candidate(workspace: Folder, name: str) -> GroundedError:
 
 
 def _unknown(name: str, kind: str, known: Sequence[str]) -> GroundedError:
-    short = _SHORT.fullmatch(name)
-    meant = f"{kind[0]}{int(short[1]):04d}" if short else ""
-    if meant in known:
-        return GroundedError(found("search.unknown", name, kind=kind, meant=meant))
-    there = ranges(known) or "none yet"
-    return GroundedError(found("search.unknown", name, kind=kind, known=there))
+    meant = f"{kind[0]}{name.lstrip('ctCT').zfill(4)}"  # t2, T0002 or 2
+    there = {"meant": meant} if meant in known else {"known": ranges(known) or "none yet"}
+    return refused("search.unknown", name, kind=kind, **there)
 
 
 def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str]) -> tuple[str, ...]:
     """Return the trials that fit and diagnose are to use, in lower case; empty: all usable ones.
-
-    Args:
-        workspace: the workspace.
-        names: the names that were given.
-        usable: the trials that can be used.
 
     Raises:
         GroundedError: if nothing can be used, or a name is no usable trial.

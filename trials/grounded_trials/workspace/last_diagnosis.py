@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, found
 from grounded.search.planner import model_fingerprint
 from grounded.share import Share, share_of
 from grounded_trials.store.documents import read_as, write_document
@@ -113,19 +113,8 @@ def left_out(workspace: Folder) -> list[Finding]:
     Raises:
         GroundedError: if a stored file is damaged.
     """
-    model, dt = workspace.base_model, workspace.config.task.dt
-    paced, others = dict[float, list[str]](), list[str]()
-    for one in workspace.trials():
-        if not workspace.fits(one.trial):
-            names = (one.trial.state_names, one.trial.input_names)
-            same = names == (model.state_names, model.input_names)
-            (paced.setdefault(one.trial.dt, []) if same else others).append(one.stored.id)
-    now = Quantity(dt, "s")
-    told = [
-        found("search.left_out", *ids, was=Quantity(was, "s"), now=now)
-        for was, ids in paced.items()
-    ]
-    return told + ([found("search.left_out", *others, model="model.py")] if others else [])
+    others = [one.stored.id for one in workspace.trials() if not workspace.fits(one.trial)]
+    return [found("search.left_out", *others)] if others else []
 
 
 # what changed since a diagnosis

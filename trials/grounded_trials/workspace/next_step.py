@@ -231,11 +231,6 @@ def after_log(workspace: Folder, verdict: str, now: Standing | None) -> NextComm
     """Return the command after ingesting a log: usually `propose`, `diagnose` for data or a probe.
 
     Data beside a search whose candidate waits leave that next.
-
-    Args:
-        workspace: the workspace that has stored the log.
-        verdict: `Ingested.verdict`.
-        now: the standing of the search including the log; None for data.
     """
     if verdict == "probe":
         return DIAGNOSE

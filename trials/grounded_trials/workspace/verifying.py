@@ -59,14 +59,7 @@ def verify_in(workspace: Folder) -> Verified:
 
 
 def _check_candidate(workspace: Folder, known: Noted, stored: set[str], path: Path) -> None:
-    """Check the file of a candidate that exists or existed.
-
-    Args:
-        workspace: the workspace.
-        known: its notes.
-        stored: trials that are there, or reported as missing already.
-        path: where the file is or was.
-    """
+    """Check the file of a candidate that exists or existed."""
     handed = known.handed.get(path.stem, set())
     carried = (one.ran in handed for one in workspace.whole_trials())
     if not path.exists() and any(carried):  # a trial contains the file

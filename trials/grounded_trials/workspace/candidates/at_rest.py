@@ -1,7 +1,5 @@
 """Find where the robot rests: the input that holds it at its start, and its start by its logs.
 
-If the task begins with an input under which the robot is not at rest, another one may hold it.
-
 Without a start, a step or a path would begin at zero: a plate at 0 degC in a room of 23 degC. Only
 states whose value the physics depends on are read off a log (a temperature, an angle under
 gravity). A position that may be anywhere is for the user to choose.
@@ -16,16 +14,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, found
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.model import Model, is_clock
-from grounded.places import integrals, rate_states
+from grounded.places import rate_states
 from grounded.search.first_guess import trim
 from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.wording import per_second, with_unit
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import OFFERED
@@ -102,10 +98,6 @@ def steady(sent: Array, span: Array | float) -> Array:
 
     The scatter is judged by its rms: a controller that holds a robot answers the noise of its
     sensors, so that commands tremble by several times that around what holds it.
-
-    Args:
-        sent: the inputs.
-        span: their range in the whole log.
     """
     most = STEADY * np.asarray(span)
     return np.asarray((np.abs(drift(sent)) <= most) & (sent.std(axis=0) <= most))
@@ -120,70 +112,11 @@ def drift(values: Array) -> Array:
     return np.asarray(np.tensordot(t, values, axes=1) / (t**2).sum() * (steps - 1))
 
 
-UNGIVEN = 3  # largest number of states without a start value that are solved for
 # the robot is at rest if it moves less than this share of the motion as configured
 AT_REST_SHARE = 1e-3
-ZERO_INPUT = 1e-6  # fraction of an input's range (of 1 unit without limits) treated as zero
 BEGUN = (0.0, 1.0, -1.0)  # offsets tried: a thrust that is squared has zero slope at 0
 STILL = 1e-9  # motion in a step, in a state's unit, that counts as none
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
-
-
-def held_before(workspace: Folder) -> Finding | None:
-    """Return that the robot is not at rest at its start, but would be under another input.
-
-    Values of states that the user did not give (a fan's speed, say) may be changed too. Nothing is
-    told if the user gave the inputs, or if they make no difference: without weights on changes and
-    without latency the first command does not depend on the input held before.
-    """
-    base, planner, config = workspace.task, workspace.planner, workspace.config.task
-    task, n, names = planner.plan, base.model.n, planner.plan.model.input_names
-    assert base.latency is not None
-
-    # The input is solved for with the memory of adopted effects, which settles, and if that rests
-    # nowhere with the few states without a start, too; the start of a sensor with a bias is none.
-    memory = np.arange(task.model.n) >= n
-    biased = {str(e["name"]).removeprefix("sensor_bias:") for e in workspace.config.model.effects}
-    free = memory.copy()
-    for i, name in enumerate(base.model.state_names):
-        free[i] = name not in config.start and (np.isnan(base.target[0, i]) or name in biased)
-    free[[one.j for one in integrals(base.model) if one.exact]] = False  # at rest, a rate is 0
-    chosen = any(name in config.start for name in names)
-    priced = bool(base.reward.input_change.any() or base.latency.any())
-    stands = None if chosen or not priced else resting(task, memory, planner.loose)
-    if stands is None and 0 < free[:n].sum() <= UNGIVEN:
-        stands = resting(task, free, planner.loose)
-    if stands is None:
-        return None
-
-    # It is told where it differs from what is given by more than rounding.
-    given = np.append(task.start[:n], task.past)
-    stands = np.append(stands[:n], stands[task.model.n :])
-    turned = given[:n] + base.model.difference(stands[:n], given[:n])
-    stands[:n] = np.where(base.model.angle_mask, turned, stands[:n])  # no whole turns
-    span = np.append(np.ones(n), task.high - task.low)
-    span = np.where(np.isfinite(span), span, np.maximum(1.0, np.abs(given)))
-    stands[np.abs(stands) < ZERO_INPUT * span] = 0.0
-    if not (np.abs(stands - given) > ZERO_INPUT * span).any():
-        return None
-    rate = moved_at_start(task, task.past)[:n] / task.dt
-    k = int(np.argmax(np.abs(rate)))
-    units, state = {**base.model.states, **task.model.inputs}, base.model.state_names[k]
-    told = np.abs(stands - given) > AT_REST_SHARE * (1 + np.abs(stands))
-    told[n:] = True
-    other = {name: to for name, to, tell in zip(units, stands, told, strict=True) if tell}
-    before = dict(zip(units, given, strict=True))
-    whole = {name: f"{value:.10g}" for name, value in config.start.items() if name in units}
-    whole |= {name: f"{to:.4g}" for name, to in other.items()}
-    return found(
-        "plan.not_at_rest",
-        state,
-        then=NextCommand("propose"),  # after [task] start is changed
-        held=tuple(with_unit(f"{name} = {before[name]:.4g}", units[name]) for name in other),
-        state=state,
-        rate=Quantity(rate[k], per_second(units[state])),
-        start=f"{{ {', '.join(f'{n} = {whole[n]}' for n in units if n in whole)} }}",
-    )
 
 
 def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
@@ -285,11 +218,6 @@ def rest_at_end(
     """Return columns and weights for the free states of a line; None if it leaves none free.
 
     These are the states that have a rate, with it; if none has one, the first. They rest at 0.
-
-    Args:
-        workspace: the workspace with the model.
-        columns: the line.
-        start: [task] start.
     """
     model = workspace.base_model
     rates, free = rate_states(model), [name for name in model.states if name not in columns]

@@ -124,10 +124,6 @@ class Exported(Document):
     search_ended: bool = False  # whether it is the best candidate of a search that has ended
     named: tuple[str, ...] = field(metadata=UNSAID, default=())  # options of `next` for its log
 
-    def summary(self) -> str:
-        """Return the candidate and its file."""
-        return f"{self.candidate}: {self.file}"
-
 
 RUNS = ("csv", "npz")  # formats of a trial
 

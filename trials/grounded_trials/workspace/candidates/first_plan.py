@@ -1,4 +1,4 @@
-"""What a task's configuration leaves open, told with its first plan: limits, idle inputs, rest."""
+"""What a task's configuration leaves open, told with its first plan: limits, idle inputs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from grounded.findings import Finding, found
 from grounded.frozen import Array
 from grounded.places import samples
 from grounded.task import Task
-from grounded_trials.workspace.candidates.at_rest import held_before
 from grounded_trials.workspace.folder import Folder
 
 if TYPE_CHECKING:
@@ -19,14 +18,7 @@ if TYPE_CHECKING:
 
 
 def left_open(workspace: Folder, made: Candidate | None) -> Iterator[Finding]:
-    """Yield what the operator should know of the configuration before the first run.
-
-    If one has a command, that comes first: a second `propose` hands the candidate out.
-
-    Args:
-        workspace: a workspace in which nothing was run yet.
-        made: the first plan, or None if it was refused.
-    """
+    """Yield what the operator should know of the configuration before the first run."""
     task = workspace.task
     if free := unlimited(task):
         yield found("plan.no_limits", *free)
@@ -36,8 +28,6 @@ def left_open(workspace: Folder, made: Candidate | None) -> Iterator[Finding]:
             yield no_effect(workspace, idle)
     if log := workspace.config.seen_in:
         yield found("plan.limits_of_log", log=log)
-    if one := held_before(workspace):
-        yield one
 
 
 def unlimited(task: Task) -> list[str]:

@@ -171,9 +171,6 @@ class Check:
     def refuse_foreign(self, found_hash: str) -> None:
         """Refuse a candidate for another robot, or one not equal to what was handed out or run.
 
-        Args:
-            found_hash: SHA-256 of its file.
-
         Raises:
             GroundedError: if it is such a candidate.
         """

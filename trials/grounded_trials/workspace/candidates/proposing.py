@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,7 +14,6 @@ from grounded.search.difference import in_question, last_gain
 from grounded.search.noise import noise_cost, noise_missed, sensor_noise
 from grounded.search.standing import Phase
 from grounded_trials.wording import rendered
-from grounded_trials.workspace.candidates import trust
 from grounded_trials.workspace.candidates.handover import (
     Void,
     check_log,
@@ -30,7 +29,7 @@ from grounded_trials.workspace.candidates.search_state import (
     standing_in,
     undecided,
 )
-from grounded_trials.workspace.candidates.trust import Extent, much_noise
+from grounded_trials.workspace.candidates.trust import Extent, extent_of, much_noise, promises
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import Since, left_out
 from grounded_trials.workspace.next_step import Situation, to_run
@@ -57,10 +56,7 @@ class Proposed(Result):
     noise_cost: float = 0.0  # expected cost of sensor noise in its log, beyond what is predicted
     off_target: tuple[OffTarget, ...] = ()  # errors of the predicted run, in units
     again: bool = False  # whether the candidate was run before
-    made: Finding | None = None  # how the candidate was made
-    predicted: Finding | None = None
-    so_far: Finding | None = None  # the best one's utility
-    trust: Finding | None = None
+    promises: Mapping[str, Finding] = field(default_factory=dict)  # by the label of a line
     extent: tuple[Extent, ...] = ()  # where the predicted run goes
 
     @property
@@ -82,8 +78,7 @@ class Proposed(Result):
         told = self.proposal.to_json() | {"file": str(self.file) if self.file else None}
         errors = [one.to_json() for one in self.off_target]
         age = self.candidate.sample_age if self.candidate else None
-        every = [*self.standing.findings, *self.findings]
-        every += [one for one in (self.made, self.predicted, self.so_far, self.trust) if one]
+        every = [*self.standing.findings, *self.findings, *self.promises.values()]
         told |= {"notes": list(self.notes)}
         told |= {"findings": [one.to_json() for one in every]}
         return told | {"noise_cost": self.noise_cost, "off_target": errors, "sample_age_s": age}
@@ -157,19 +152,16 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
     if candidate is not None:
         notes = notes + left if not proposal.is_new else notes or left or changed
         notes = [one.also(instead=candidate.id) for one in notes]
-    first: list[Finding] = []
     if not now.trials and (candidate is None or proposal.is_new):
         from grounded_trials.workspace.candidates.first_plan import left_open  # not for `status`
 
-        first = [*left_open(workspace, candidate)]
-        notes += first
-    asked = next((one.then for one in first if one.then), None)
+        notes += left_open(workspace, candidate)
     status = status_of(workspace, now)
     if now.doubt and Situation(workspace, now, status.diagnosis).doubted:
         notes.append(now.doubt)
     if candidate is None:
-        return _ended(workspace, proposal, status, notes, asked)
-    return _told(workspace, proposal, notes, asked or to_run(workspace, candidate.id))
+        return _ended(workspace, proposal, status, notes)
+    return _told(workspace, proposal, notes)
 
 
 def _ended(
@@ -177,22 +169,16 @@ def _ended(
     proposal: Proposal,
     status: Status,
     notes: Sequence[Finding],
-    asked: NextCommand | None,
 ) -> Proposed:
     """Return that there is nothing to run."""
     best, converged = proposal.standing.incumbent, status.standing.phase is Phase.CONVERGED
     if best and converged and best.candidate.model != workspace.planner.fingerprint:
         notes = [*notes, found("plan.no_better", best.candidate.id)]
     over = replace(proposal, standing=status.standing)
-    return Proposed(over, None, asked or status.then, settle((*proposal.findings, *notes)))
+    return Proposed(over, None, status.then, settle((*proposal.findings, *notes)))
 
 
-def _told(
-    workspace: Folder,
-    proposal: Proposal,
-    notes: Sequence[Finding],
-    then: NextCommand,
-) -> Proposed:
+def _told(workspace: Folder, proposal: Proposal, notes: Sequence[Finding]) -> Proposed:
     """Return a candidate with what it promises and how far that can be trusted."""
     made, now, task = proposal.candidate, proposal.standing, workspace.task
     assert made is not None
@@ -203,22 +189,19 @@ def _told(
     ahead = off_target_of(task, [made.predicted_run])
     if not made.grounded:  # a run that no sensor measured
         ahead = tuple(replace(one, noise=0.0) for one in ahead)
-    best, again = now.incumbent, any(t.trials for t in same)
+    again = any(t.trials for t in same)
     slow = workspace.planner.plan.model.system.note
     notes = [*notes, *([found("plan.model", what=slow)] if slow else [])]
     return Proposed(
         proposal,
         workspace.candidate_path(made.id),
-        then,
+        to_run(workspace, made.id),
         settle((*proposal.findings, *notes)),
         cost,
         ahead,
         again,
-        trust.made_how(made, task, now.history),
-        trust.predicted(made, cost, whole),
-        None if best is None else trust.so_far(made, best),
-        trust.trust(workspace, made, now, whole - cost),
-        trust.extent_of(made, task),
+        promises(workspace, made, now, cost, whole),
+        extent_of(made, task),
     )
 
 
@@ -246,13 +229,9 @@ def _handed_over(
         except Void as error:
             if proposal.is_new:
                 raise
-            why, name = in_words(error.reasons), candidate.id
-            if any(t.trial.candidate == name for t in workspace.trials()):
-                waits = proposal.standing.sentence
-                raise GroundedError(
-                    found("plan.waits_void", name, standing=waits, why=why, candidate=name)
-                ) from None
-            void[name] = why
+            if any(t.trial.candidate == candidate.id for t in workspace.trials()):
+                raise
+            void[candidate.id] = in_words(error.reasons)
         else:
             return replace(proposal, findings=(*proposal.findings, *handed.findings)), void
 

@@ -46,10 +46,6 @@ class Ran(Document):
         """The command that ingests the trial."""
         return NextCommand("ingest", (str(self.trial_file),))
 
-    def summary(self) -> str:
-        """Return what was run, and where its trial is."""
-        return f"{self.candidate}: {self.trial_file}"
-
 
 def run_candidate(
     workspace: Folder,

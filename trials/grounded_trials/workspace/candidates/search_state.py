@@ -128,13 +128,7 @@ def planned(
 
 
 def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing | None:
-    """Return the end of a search that was planned before; None if it goes on or is not known.
-
-    Args:
-        workspace: the workspace.
-        contents: its contents.
-        now: the standing, which asks for a candidate.
-    """
+    """Return the end of a search that was planned before; None if it goes on or is not known."""
     kept = stored(_place(workspace), KIND)
     if kept is None:
         return None
@@ -188,11 +182,6 @@ def _version() -> tuple[str, int]:
 def candidate_named(workspace: Folder, name: str | None, now: Standing | None = None) -> str:
     """Return the id of the named candidate, of the best for `best`, of the outstanding for None.
 
-    Args:
-        workspace: the workspace.
-        name: an id, "best" or None.
-        now: the standing of the search, if known.
-
     Raises:
         GroundedError: if there is none of that name, no best one yet, or none is outstanding.
     """
@@ -233,13 +222,7 @@ def overtaken(workspace: Folder, *, ran: bool = False) -> Finding | None:
 
 
 def none_waits(workspace: Folder, log: str = "", best: str = "") -> Finding:
-    """Return that no candidate waits for a trial; if the model was changed, that this is why.
-
-    Args:
-        workspace: the workspace.
-        log: the log of a run that was to be ingested, if any.
-        best: the candidate that it may have run instead, if any.
-    """
+    """Return that no candidate waits for a trial; if the model was changed, that this is why."""
     told = overtaken(workspace)
     if told is None or told.facts.get("why") != MODEL:
         told = found("search.none_waits", log=log or None)

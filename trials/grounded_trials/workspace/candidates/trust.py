@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.findings import Finding, Quantity, found
-from grounded.findings.finding import Fact
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.step_size import Step
 from grounded.task import Task
@@ -30,15 +29,7 @@ STATES = 3  # target states whose range is told
 
 @dataclass(frozen=True)
 class Extent:
-    """Where a predicted run goes in one state or input.
-
-    Args:
-        name: of the state or input.
-        unit: its unit.
-        low: least value.
-        high: greatest value.
-        limits: hard limits of an input that has them.
-    """
+    """Where a predicted run goes in one state or input."""
 
     name: str
     unit: str
@@ -94,85 +85,57 @@ def made_how(made: Candidate, task: Task, history: tuple[Tried, ...]) -> Finding
     )
 
 
-def so_far(made: Candidate, best: Tried) -> Finding:
-    """Return the best one's utility and, if it differs clearly, what the model gives it.
-
-    The gain of the candidate is counted from what the model gives the best one.
-    """
-    own = best.candidate.id
-    unlike = made.base == own and made.unlike(best.utility)
-    gain = made.predicted_gain if unlike else None
-    return found(
-        "plan.so_far",
-        own,
-        best=own,
-        candidate=made.id,
-        utility=best.utility,
-        noise=much_noise(best.noise_cost, best.utility),
-        model=made.expected_of_base if unlike else None,
-        gain=gain,
-    )
-
-
 def much_noise(noise: float, utility: float) -> float | None:
     """Return how much of a logged run's cost is due to sensor noise, if it is much."""
     return min(noise, -utility) if noise > NOISE_SHARE * -utility else None
 
 
-def predicted(made: Candidate, cost: float, whole: float) -> Finding:
-    """Return the predicted utility, and what is to be expected of its log.
+def promises(
+    workspace: Folder, made: Candidate, now: Standing, cost: float, whole: float
+) -> dict[str, Finding]:
+    """Return what is told of a candidate, by the label of its line.
 
     Args:
+        workspace: the workspace with the trials.
         made: the candidate.
+        now: the standing of the search.
         cost: of the sensor noise in its log that its prediction lacks.
         whole: of all of the sensor noise in its log.
     """
-    promised = made.predicted_utility
+    promised, best = made.predicted_utility, now.incumbent
     in_log = promised - cost
-    return found(
-        "plan.predicted",
-        made.id,
-        utility=promised,
-        log=in_log if cost > 0 and f"{in_log:.4g}" != f"{promised:.4g}" else None,
-        noise=much_noise(whole, in_log),
-    )
+    log = in_log if cost > 0 and f"{in_log:.4g}" != f"{promised:.4g}" else None
+    noise = much_noise(whole, in_log)
+    told = {
+        "what": made_how(made, workspace.task, now.history),
+        "predicted": found("plan.predicted", made.id, utility=promised, log=log).also(noise=noise),
+    }
+    if best is not None:
+        own = best.candidate.id
+        noise = much_noise(best.noise_cost, best.utility)
+        said = found("plan.so_far", own, best=own, utility=best.utility, noise=noise)
+        if made.base == own and made.unlike(best.utility):
+            # the gain of the candidate is counted from what the model gives the best one
+            gain, of_base = made.predicted_gain, made.expected_of_base
+            said = said.also(candidate=made.id, model=of_base, gain=gain)
+        told["so far"] = said
+    return told | {"trust": _trust(workspace, made, now)}
 
 
-def trust(workspace: Folder, made: Candidate, now: Standing, replayed: float) -> Finding:
-    """Return how far recent predictions were off, and whether the promised gain exceeds that.
-
-    `replayed` is the cost of the noise that its prediction has, from the log that it replays.
-    """
+def _trust(workspace: Folder, made: Candidate, now: Standing) -> Finding:
+    """Return how far the last predictions were off, and the gain that this one promises."""
     ran = [tried for tried in now.history if tried.utilities]
     same = [tried for tried in ran if tried.candidate.model == workspace.planner.fingerprint]
-    if same:
-        return _tested(made, now, same, replayed)
-    logs = len(workspace.trials()) - sum(len(tried.trials) for tried in now.history)
-    exact = not now.trials and not workspace.config.reachable
-    changed = int(bool(ran))
-    return found("plan.untested", made.id, changed=changed, exact=int(exact), logs=logs)
-
-
-def _tested(made: Candidate, now: Standing, same: list[Tried], replayed: float) -> Finding:
-    """Return by how much the last predictions missed, and the gain that this one promises.
-
-    The gain is one of predictions, which take the noise of a single log that they replay for what
-    the robot does (`replayed`).
-    """
+    if not same:
+        logs = len(workspace.trials()) - sum(len(tried.trials) for tried in now.history)
+        exact = not now.trials and not workspace.config.reachable
+        return found("plan.untested", made.id, changed=len(ran), exact=int(exact), logs=logs)
     last = sorted(same, key=lambda tried: max(trial.id for trial in tried.trials))[-LAST:]
     missed = [abs(one.promised - one.utility) for one in last]
     whole = tuple(f"{off:.2g}" for off in missed if math.isfinite(off))
-    best, once = now.incumbent, len(missed) == 1
-    facts: dict[str, Fact | None] = {
-        "missed": whole,
-        "failed": len(missed) - len(whole),
-        "promised": last[-1].promised if once else None,
-        "real": last[-1].utility if once else None,
-    }
+    said = found("plan.tested", made.id, missed=whole, failed=len(missed) - len(whole))
     tried = {one.candidate.id for one in now.history}
     asked = made.id not in tried and made.way != "gentler gains"  # no model swings
-    gain = made.promised_over(best) if best is not None and asked else 0.0
-    if gain > 0 and best is not None and math.isfinite(missed[-1]):
-        noise = len(best.trials) == 1 and gain < replayed
-        facts |= {"gain": gain, "less": int(gain < missed[-1]), "noise": int(noise)}
-    return found("plan.tested", made.id).also(**facts)
+    gain = made.promised_over(now.incumbent) if now.incumbent and asked else 0.0
+    less = int(gain < missed[-1])
+    return said.also(gain=gain, less=less) if gain > 0 and math.isfinite(missed[-1]) else said

@@ -85,12 +85,7 @@ class Held:
 
     @classmethod
     def of(cls, workspace: Folder, values: Mapping[str, Estimate]) -> tuple[Self, Lost]:
-        """Return what the file of a workspace's model holds now, and the effects that it can't.
-
-        Args:
-            workspace: the workspace, whose model is MuJoCo's.
-            values: of parameters and effects, with their +-, see `known_values`.
-        """
+        """Return what the file of a workspace's model holds now, and the effects that it can't."""
         step, latency = workspace.base_model.step, workspace.config.task.latency
         assert isinstance(step, MujocoStepper) and step.source is not None
         own = {s.name: (values[s.name].value, values[s.name].std) for s in step.settings}

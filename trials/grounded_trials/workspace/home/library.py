@@ -73,10 +73,6 @@ class Shelved(Document):
     values: Mapping[str, Mapping[str, Any]]  # as `as_table`
     findings: tuple[Finding, ...] = ()
 
-    def summary(self) -> str:
-        """Return the actuator and its file."""
-        return f"{self.actuator}: {self.file}"
-
 
 def as_table(one: Estimate) -> dict[str, Any]:
     """Return a number as the file has it; the std only if it is known."""

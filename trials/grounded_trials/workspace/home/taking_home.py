@@ -61,10 +61,6 @@ class TakenHome(Document):
     findings: tuple[Finding, ...]
     others: tuple[Path, ...] = ()  # files that it includes, written beside it
 
-    def summary(self) -> str:
-        """Return the file."""
-        return str(self.file)
-
 
 def export_model(workspace: Folder, path: str | Path | None = None) -> TakenHome:
     """Write the model as it is now, in the form that it came in, for other programs.
@@ -200,10 +196,6 @@ def with_values(path: Path, values: Mapping[str, float]) -> tuple[str, list[str]
 
     A parameter stands as `"L": Param(0.17, ...)` or `params=dict(L=Param(...))`; the expression of
     its value is replaced by the number.
-
-    Args:
-        path: the file.
-        values: by name of the parameter.
     """
     source = path.read_bytes()
     lines = source.splitlines(keepends=True)

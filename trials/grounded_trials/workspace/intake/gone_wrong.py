@@ -56,12 +56,7 @@ RECENT = 50  # runs that are looked at; the way of placing a robot may change
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """A trial as stored, beside its candidate and the search.
-
-    Args:
-        workspace: the workspace with the task, the model and the candidates.
-        trial: the trial as stored.
-    """
+    """A trial as stored, beside its candidate and the search."""
 
     workspace: Folder
     trial: Trial

@@ -26,7 +26,7 @@ from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import NULL, UNSAID, Document, with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
-from grounded.trial import HUGE, Trial
+from grounded.trial import Trial
 from grounded_trials.store.own_files import CANDIDATE, TRIAL, format_of
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
@@ -140,14 +140,7 @@ def ingest_log(
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str) -> Ingested:
-    """Return the result for a trial that was just stored: findings, verdict, next command.
-
-    Args:
-        workspace: the workspace with the task and the candidates.
-        read: how it was read.
-        added: its file in the store.
-        before: the trial that it repeats to the last bit, or "".
-    """
+    """Return the result for a trial that was just stored: findings, verdict, next command."""
     run = Run(workspace, replace(read.trial, id=added.id))
     aside, ran = added.id in workspace.discarded(), bool(run.trial.candidate)
     told = [*read.findings, *_circumstances(run, read, before, aside=aside)]
@@ -178,14 +171,7 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str) -> Ingeste
 
 
 def _circumstances(run: Run, read: Read, before: str, *, aside: bool) -> Iterator[Finding]:
-    """Yield what is to be known of a log beside the store and the search.
-
-    Args:
-        run: the trial.
-        read: how it was read.
-        before: the trial that it repeats to the last bit, or "".
-        aside: whether it is set aside.
-    """
+    """Yield what is to be known of a log beside the store and the search."""
     workspace, now = run.workspace, run.now
     if before:
         yield found("log.repeats", before)
@@ -221,10 +207,6 @@ def _checked(run: Run) -> Iterator[Finding]:
     if filled.samples:
         longest, at = Quantity(filled.longest_s, "s"), Quantity(filled.at_s, "s")
         yield found("log.gaps", filled.state, samples=filled.samples, longest=longest, at=at)
-    if whole.finite_steps < whole.steps:
-        name, step = _first_bad(whole)
-        ends = Quantity(step * whole.dt, "s") if step else "its start"
-        yield found("file.vanished", name, ends=ends)
     if not whole.candidate:
         yield from _still(whole)
         yield from _beyond(run.workspace, whole)
@@ -233,18 +215,6 @@ def _checked(run: Run) -> Iterator[Finding]:
     if np.ptp(run.own.predicted_states, axis=0).any():
         yield from _still(run.run)
     yield from _unsafe(task, run.run, run.own)
-
-
-def _first_bad(trial: Trial) -> tuple[str, int]:
-    """Return the first state or input that is not a finite number, and its step."""
-    places = [
-        (int(step), name)
-        for values, names in ((trial.states, trial.state_names), (trial.inputs, trial.input_names))
-        for column, name in zip(values.T, names, strict=True)
-        for step in np.flatnonzero(~(np.abs(column) < HUGE))[:1]
-    ]
-    step, name = min(places, key=lambda place: place[0])
-    return name, step
 
 
 def _unsafe(task: Task, trial: Trial, ran: Candidate) -> Iterator[Finding]:

@@ -41,12 +41,7 @@ def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[F
 
 
 def column_faults(workspace: Folder, known: Trial) -> list[Finding]:
-    """Return the faults of columns: units, signs, places, dead sensors.
-
-    Args:
-        workspace: the workspace with the model.
-        known: the trial up to its last known step.
-    """
+    """Return the faults of columns: units, signs, places, dead sensors."""
     model = workspace.base_model
     if known.steps < 2:
         return []

@@ -117,12 +117,6 @@ def fall_in(
 ) -> tuple[int, Finding] | None:
     """Find where a run left [safety], if its commands ceased to be the candidate's about then.
 
-    Args:
-        task: the task with [safety] and the horizon.
-        own: the candidate.
-        trial: the run and what follows it, with the task's states and inputs.
-        ran: the comparison of its commands with the candidate's.
-
     Returns:
         The steps of the run before it failed, and the finding.
         None if the commands are the candidate's to the end, or never were; if the run was inside

@@ -65,11 +65,7 @@ SHORTER = 1.0  # [nats] that a fall costs
 class Case:
     """A log that should be the run of a candidate, and all that stories of it are made from.
 
-    Args:
-        workspace: the workspace with the candidates.
-        path: the log, for messages.
-        read: what it contains: the trial that would be stored.
-        log: the log in which its commands are judged; None if `read` was written by grounded.
+    `log` is that in which its commands are judged; None if `read` was written by grounded.
     """
 
     def __init__(self, workspace: Folder, path: Path, read: Read, log: ForeignLog | None) -> None:
@@ -175,12 +171,6 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
 
     A foreign log without a [log.span] may begin before the run: it is cut where the run begins.
 
-    Args:
-        workspace: the workspace with the candidates.
-        path: the log, for messages.
-        read: what it contains.
-        candidate: the candidate that the user named, if any.
-
     Raises:
         GroundedError: if it is not a run of its candidate, with what it is instead if known.
     """
@@ -235,12 +225,6 @@ def stories_of_log(log: Recording, task: Task, own: Candidate, start: Start | No
 
     The commands don't tell where its run begins: so the table is asked at the start found, at the
     first command, and at the instants at which commands begin to change.
-
-    Args:
-        log: a log whose commands are not the candidate's.
-        task: the task with the control step.
-        own: the candidate.
-        start: the start that fits best, if any.
     """
     at = [*([start.seconds] if start else []), log.first, *log.openings[:TRIED]]
     how: dict[str, Any] = {"logged": log.measured, "waits": log.waits}

@@ -190,10 +190,7 @@ def as_toml(value: Any) -> Any:
 def set_keys(file: Path, table: str, **values: Any) -> None:
     """Replace keys in a table of grounded.toml; the rest of the file is unchanged.
 
-    Args:
-        file: grounded.toml.
-        table: the name of the table.
-        **values: the new values; None: the old one stays, an empty one is removed.
+    A value of None leaves the old one, an empty one removes the key.
 
     Raises:
         GroundedError: if the file can't be written.
@@ -286,11 +283,7 @@ def set_target(
 
 
 def made_changes(text: str) -> dict[str, float]:
-    """Return the `input_change` weights that `init --from` or `target` wrote, from their comment.
-
-    Args:
-        text: the text of grounded.toml.
-    """
+    """Return the `input_change` weights that `init --from` or `target` wrote, by their comment."""
     found = MADE.search(text)
     with suppress(tomllib.TOMLDecodeError):
         weights = tomllib.loads(found[0].removeprefix("# "))["input_change"] if found else {}

@@ -28,11 +28,6 @@ from grounded_trials.workspace.user_files.config import Config
 def build_task(config: Config, model: Model, folder: Path) -> Task:
     """Build the task that the files describe.
 
-    Args:
-        config: the checked grounded.toml.
-        model: the model whose states and inputs the files name.
-        folder: the folder of the files.
-
     Raises:
         GroundedError: for a name that is not in the model, or sizes that do not fit; the message
             names the file and the key.
@@ -45,11 +40,6 @@ def build_task(config: Config, model: Model, folder: Path) -> Task:
 
 def check_tables(config: Config, model: Model, rows: int) -> None:
     """Check all of grounded.toml that a task is built from, whatever its target will be.
-
-    Args:
-        config: the checked grounded.toml.
-        model: the model whose states and inputs the file names.
-        rows: of the new target.
 
     Raises:
         GroundedError: as `build_task`.
@@ -195,13 +185,6 @@ def target_arrays(
 ) -> tuple[Array, Array | None]:
     """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None.
 
-    Args:
-        path: the CSV file.
-        states: the model's states, n.
-        inputs: the model's inputs, m.
-        dt: control interval [s].
-        horizon: control steps, H.
-
     Raises:
         GroundedError: for an unknown column, too few rows, or times off the control grid.
     """
@@ -302,10 +285,6 @@ def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> lis
     """Return the states for whose unit no column moves or exceeds UNKNOWN.
 
     The target does not show what a small error of such a state is.
-
-    Args:
-        columns: the columns of a target, by state.
-        units: the units of the model's states.
     """
     told = {
         units.get(name, "")
@@ -332,12 +311,7 @@ def write_target(path: Path, dt: float, columns: dict[str, Array]) -> None:
 
 
 def target_text(dt: float, columns: dict[str, Array]) -> str:
-    """Format a target as CSV.
-
-    Args:
-        dt: control interval [s].
-        columns: states in the order of the file, (H + 1,) each.
-    """
+    """Format a target as CSV."""
     H = len(next(iter(columns.values())))
     lines = [",".join(["t", *columns])]
     for i in range(H):

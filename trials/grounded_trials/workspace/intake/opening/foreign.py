@@ -121,26 +121,6 @@ class ForeignLog:
             late = Quantity(grid.late_s, "s")
             raise GroundedError(found("log.late_states", where=str(self.path), late=late))
 
-    @property
-    def unlike_units(self) -> tuple[Finding, ...]:
-        """The columns in a multiple of the model's unit without a scale in [log]."""
-        from grounded_trials.logs.stated_units import Stated
-
-        model, said = (
-            self.workspace.base_model,
-            Stated({one.spec.path: one.unit for one in self.series.values()}),
-        )
-        units, some = {**model.states, **model.inputs}, []
-        for name, one in self.series.items():  # including that of [log.span]
-            path, wanted = one.spec.path, units.get(name, "")
-            kind, factor = "input" if name in model.inputs else "state", said.factor(path, wanted)
-            if one.spec.scale == 1 and abs(factor - 1) > 1e-9:
-                table, unit = f"[log.{kind}.{name}]", said.unit(path)
-                some.append(
-                    found("log.stated", name, unit=unit, own=wanted, table=table, by=factor)
-                )
-        return tuple(some)
-
     @cached_property
     def stored(self) -> tuple[StoredTrial, ...]:
         """The trials that were made from a file with the same bytes, whatever its name."""
@@ -279,13 +259,7 @@ def rates_of(model: Model) -> tuple[str, ...]:
 
 
 def begun(grid: Gridded, dt: float, inputs: Sequence[str]) -> Iterator[Finding]:
-    """Yield where data begin, the timing of their commands, and a dt that does not fit."""
-    first = dict(zip(inputs, grid.inputs[0].tolist(), strict=True))
-    sent = {name: value for name, value in first.items() if value}
-    if sent and (grid.moved_s > dt or grid.assumed):
-        name, value = next(iter(sent.items()))
-        at = (grid.start_ns - grid.origin_ns) * 1e-9
-        yield found("log.from", *sent, at=at, name=name, value=value)
+    """Yield a dt that does not fit the commands."""
     slow = [one for one in grid.reports if one.name in inputs and 0 < one.rate_hz * dt < 1 / SLOWER]
     if slow:
         every = 1 / max(one.rate_hz for one in slow)
@@ -333,7 +307,6 @@ def cut_log(log: ForeignLog, candidate: str, start: float | None = None) -> Read
         encoded,
         (
             *misread(log.workspace.base_model, log.mapping),
-            *log.unlike_units,
             *remarks,
             *grid.findings,
             *(() if candidate else begun(grid, trial.dt, trial.input_names)),

@@ -202,13 +202,7 @@ def recording(
     task: Task,
     series: Mapping[str, Series],
 ) -> Recording | None:
-    """Return a log in which a run may begin anywhere, or None if it can't be sampled.
-
-    Args:
-        logged: its samples.
-        task: the task with the control step and the horizon.
-        series: the same with the estimated states.
-    """
+    """Return a log in which a run may begin anywhere, or None if it can't be sampled."""
     model, dt = task.model, task.dt
     names = (model.state_names, model.input_names)
     every = [float(np.median(np.diff(np.sort(s.t)))) for s in series.values() if len(s.t) > 1]
@@ -254,12 +248,6 @@ def instants_apart(
 
     It is infinite where no run can begin: the log has to hold the complete run, or commands that
     are constant before it, for runs that were cut or stopped.
-
-    Args:
-        log: states and inputs at N instants.
-        parts: instants per step of the policy.
-        policy: the policy for these states and inputs.
-        instants: the indices to compute; None: all.
     """
     sent, H = np.clip(log.inputs, policy.low, policy.high), policy.horizon
     changed = np.any(np.diff(sent, axis=0, prepend=sent[:1]) != 0, axis=1)
@@ -348,11 +336,6 @@ class ActedOn:
 
 def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
     """Compare the commands of a log with a policy's, at the ages of samples that fit best.
-
-    Args:
-        log: the log.
-        policy: a policy for its states and inputs.
-        start: when the run begins, seconds after the log's first sample.
 
     Returns:
         The differences; None if the log can't be cut there, or is too short.

@@ -55,12 +55,6 @@ def refuse_as_another(
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
     """Return the stored file of a log's trial if it is stored, else the new one.
 
-    Args:
-        workspace: the workspace.
-        log: the log, with its `stored` trials.
-        trial: the trial as it was read now.
-        data: the file of that trial.
-
     Raises:
         GroundedError: if the same part of the log is stored with other numbers.
     """
