@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 from grounded.diagnosis.telling import instrument_lines
 from grounded.engine import Engine, cores
-from grounded.fit import Fit, FittedValue
+from grounded.fit import Fit
 from grounded.result import listed
 from grounded_cli.console.options import names_of
 from grounded_cli.console.terminal import (
@@ -28,7 +27,6 @@ HELD_OUT = (
     "rms, open loop, of each group of trials (or piece of a single log), predicted with values "
     "from the others"
 )
-DIGITS, MOST = 4, 7  # significant digits of a value, usually and at most
 
 
 def fit(
@@ -63,22 +61,13 @@ def fit(
 def _parameters(found: Fit) -> str:
     rows = []
     for name, e in found.params.items():
-        digits = _digits(e) if e.identified else DIGITS
         own = (e.low, e.high, e.start, e.value)
-        low, high, start, value = (number(or_zero(v, *own), digits) for v in own)
+        low, high, start, value = (number(or_zero(v, *own)) for v in own)
         given = f", given {listed(e.only_with)}" * bool(e.only_with)
         interval = f"{low} .. {high}{given}" if e.identified else "not identified"
         interval = "at its bound" if name in found.at_bounds else interval
         rows.append((name, start, value, interval, shown(e.unit)))
     return table(rows, ("parameter", "before", "fitted", "95 % interval", "unit"))
-
-
-def _digits(e: FittedValue) -> int:
-    """Return how many significant digits show two of the width of an interval."""
-    width, size = e.high - e.low, max(abs(e.low), abs(e.high))
-    if not 0 < width < size < math.inf:
-        return DIGITS
-    return min(max(math.floor(math.log10(size)) - math.floor(math.log10(width)) + 2, DIGITS), MOST)
 
 
 def _errors(found: Fit) -> str:

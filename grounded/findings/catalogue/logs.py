@@ -84,8 +84,7 @@ LOG: dict[str, Entry] = {
     ),
     "limits": warn(
         "{about} goes up to {most} beyond its [limits], {limits}",
-        "{how:clip=log the commands after clipping,flip=its scale in [log] is negative: multiply "
-        "these limits by -1 too,widen=widen them if the robot can take it}",
+        "{how:clip=log the commands after clipping,widen=widen them if the robot can take it}",
     ),
     # what a log lacks
     "gaps": warn(
@@ -320,9 +319,7 @@ SENSOR: dict[str, Entry] = {
     # how to mend it for good
     "mend": note(
         "{about} can be mended for good",
-        "[[the program that writes the trials should {how:late=read it with less delay or filter "
-        "it less,sign=flip its sign,degrees=write it in the model's unit}]][[treat it as {of}: "
-        "]][[if the robot's program gets it as late, `adopt` sensor_delay; else set {log} in its "
-        "table of [log]; not both]]",
+        "[[treat it as {of}: ]]if the robot's program gets it as late, `adopt` sensor_delay; else "
+        "set {log} in its table of [log]; not both",
     ),
 }

@@ -354,8 +354,8 @@ def _recorded(
 ) -> tuple[dict[str, Array], bool, tuple[Finding, ...]]:
     """Return the states (H + 1,) of a log's run, whether it has one, and what is odd about it.
 
-    The run begins where `ingest --data` lets it begin, by which `logged_target` knows it again. For
-    one that can't be sampled a placeholder is returned.
+    The run begins where `ingest --data` lets it begin. For one that can't be sampled a placeholder
+    is returned.
     """
     from grounded_trials.workspace.intake.opening.foreign import rates_of  # slow
 

@@ -131,13 +131,6 @@ def joined(
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
     """Return the parameters to set and all effects, after adding diagnosed effects to a model.
 
-    Args:
-        diagnosis: the diagnosis.
-        names: its effects to add, in any order: they are added in the order of the fit.
-        effects: the effects that the model has already.
-        nominal: the values to which changes of parameters among `names` are added.
-        calibrated: the parameters that are adopted with the effects.
-
     Raises:
         GroundedError: if a value is not known.
     """

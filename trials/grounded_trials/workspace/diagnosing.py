@@ -147,15 +147,7 @@ def diagnose_in(
 def _with_next(
     workspace: Folder, found: Diagnosis, identity: str, wrong: tuple[str, ...], *, whole: bool
 ) -> Diagnosis:
-    """Return a diagnosis with what it asks for and the next command, and write it.
-
-    Args:
-        workspace: the workspace.
-        found: the diagnosis.
-        identity: of the candidate that would separate two tied effects, "" for none.
-        wrong: the trials of candidates whose logs are at fault.
-        whole: whether all trials could be used, if they had been named.
-    """
+    """Return a diagnosis with what it asks for and the next command, and write it."""
     if wrong:
         found = found.asking(finding("gap.next.fix", *wrong), identity)
     left = len(diagnosable(workspace)) - len(found.made.trials)
@@ -236,15 +228,7 @@ def _probe(
 def probe_candidate(
     workspace: Folder, policy: Policy, run: Rollout | Trial, base: str = "", worth: float = math.nan
 ) -> Candidate:
-    """Return a policy that is no step of the search as a candidate; it is not stored yet.
-
-    Args:
-        workspace: the workspace.
-        policy: in the model's own states.
-        run: its predicted run, in the planning model's states.
-        base: the candidate that it was made from, if any.
-        worth: the predicted utility.
-    """
+    """Return a policy that is no step of the search as a candidate; it is not stored yet."""
     planner, model = workspace.planner, workspace.base_model
     return Candidate(
         id=workspace.next_id(),

@@ -87,14 +87,9 @@ class Noted:
     aside: dict[str, str] = field(default_factory=dict)  # discarded trial -> reason
     kept: set[str] = field(default_factory=set)  # trials that were discarded and restored
     handed: dict[str, set[str]] = field(default_factory=dict)  # candidate -> SHA-256 of its files
-    hand_outs: list[tuple[str, str]] = field(default_factory=list)  # candidate, last trial by then
+    last: set[str] = field(default_factory=set)  # the last trial file at each hand-out, or ""
     asked: dict[str, str] = field(default_factory=dict)  # trial to be discarded -> the finding
     groups: dict[str, str] = field(default_factory=dict)  # trial -> the condition it was run in
-
-    @property
-    def last(self) -> set[str]:
-        """The last trial file at each hand-out, or ""."""
-        return {after for _, after in self.hand_outs}
 
     def why_aside(self, stored: Stored) -> str | None:
         """Return why a trial is set aside, or None if it is not."""
@@ -125,7 +120,7 @@ def noted(notes: Iterable[Mapping[str, str]]) -> Noted:
             found.kept.add(note["trial"])
         elif kind == "hand-out":
             found.handed.setdefault(note["candidate"], set()).add(note["sha256"])
-            found.hand_outs.append((note["candidate"], note["after"]))
+            found.last.add(note["after"])
         elif kind == "asked" and "finding" in note:
             found.asked[note["trial"]] = note["finding"]
         elif kind == "group":

@@ -29,7 +29,6 @@ from grounded_trials.workspace.user_files.task_file import (
 
 PROPOSE = NextCommand("propose")
 TARGET = NextCommand("target", ("SHAPE",))
-WRITTEN = 1e-3  # tolerance for target.csv, relative to its range, due to the digits in the file
 
 
 def to_plan(workspace: Folder) -> NextCommand:
@@ -38,42 +37,18 @@ def to_plan(workspace: Folder) -> NextCommand:
 
 
 def undrawn(workspace: Folder) -> bool:
-    """Return whether no candidate was made and target.csv is still what `init --from` wrote.
+    """Return whether no candidate was made and no manoeuvre was drawn since `init`.
 
-    That is the run in the log, or, if the log could not be sampled, zeros for the first state only,
-    with a start at zero.
+    That wrote the run in a log, whose range [limits] still has, or zeros, with a start at zero.
     """
     task = workspace.config.task
     with suppress(GroundedError):  # `propose` reports an unreadable target
-        if not task.target or workspace.candidate_ids():
+        drawn = not task.target or (workspace.folder / f"{task.target}.bak").exists()
+        if drawn or workspace.candidate_ids():
             return False
-        first, *others = np.asarray(workspace.task.target, float).T
-        if first.any() or not all(np.isnan(column).all() for column in others):
-            return bool(logged_target(workspace))
-        return not task.start.get(workspace.base_model.state_names[0])
+        asks = np.nan_to_num(workspace.task.target).any() or any(task.start.values())
+        return bool(workspace.config.seen_in) or not asks
     return False
-
-
-def logged_target(workspace: Folder) -> str:
-    """Return the trial whose states target.csv still repeats, as `init --from` wrote it; or "".
-
-    Only trials that ran no candidate count, also those that are set aside: a log in a wrong unit is
-    ingested again, but target.csv is the run as it was first read. The target must equal their
-    states row by row.
-    """
-    if not workspace.config.task.target:
-        return ""
-    task = workspace.task
-    asked = np.isfinite(task.target).any(axis=0)
-    for trial in (one.trial for one in (*workspace.whole_trials(), *workspace.aside_trials())):
-        rows = len(task.target)
-        if trial.candidate or trial.steps + 1 < rows or not workspace.fits(trial):
-            continue
-        off = np.abs(trial.states[:rows, asked] - task.target[:, asked])
-        moved = np.ptp(task.target[:, asked], axis=0).max(initial=0.0)
-        if moved > 0 and off.size and np.nanmax(off) < WRITTEN * moved:
-            return trial.id
-    return ""
 
 
 def replace_target(

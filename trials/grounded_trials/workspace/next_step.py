@@ -52,12 +52,8 @@ def not_stored(workspace: Folder, candidate: str) -> Path | None:
 def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
     """Return the command that runs a candidate: `run`, or `export` and then `next` if run by hand.
 
-    A run that was not ingested yet is ingested first.
-
-    Args:
-        workspace: the workspace.
-        candidate: the candidate's id.
-        named: the name to use in the command; () for the outstanding candidate.
+    A run that was not ingested yet is ingested first. `named` is its name in the command, () for
+    the outstanding one.
     """
     if workspace.config.reachable:
         waits = not_stored(workspace, candidate)
@@ -70,17 +66,11 @@ def to_run(workspace: Folder, candidate: str, *named: str) -> NextCommand:
 
 @dataclass(frozen=True, eq=False)
 class Situation:
-    """What decides what comes next.
+    """What decides what comes next."""
 
-    Args:
-        workspace: the workspace, whose model may have changed since the diagnosis.
-        now: the standing of its search.
-        found: a diagnosis that was just made; None: the last one, if any.
-    """
-
-    workspace: Folder
+    workspace: Folder  # its model may have changed since the diagnosis
     now: Standing
-    found: Diagnosis | None = None
+    found: Diagnosis | None = None  # a diagnosis that was just made; None: the last one, if any
 
     @cached_property
     def diagnosis(self) -> Diagnosis | None:

@@ -36,26 +36,17 @@ REST = 0.1  # a target is at rest if its last step is below this fraction of its
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OffTarget(Document):
-    """The error of one state, or of the position as one distance, over all runs of a candidate.
+    """The error of one state, or of the position as one distance, over all runs of a candidate."""
 
-    Args:
-        what: the state, or "position".
-        unit: the unit of the errors.
-        rms: rms over the whole run; NaN if only its end is weighed.
-        most: the largest error.
-        at_s: when the largest error occurred, in seconds of the run.
-        end: rms of the errors at the last state; NaN if a run ended early, or if the end has no
-            weight of its own and nothing is to be reached (see `reaches`).
-        noise: std of the noise of a single sample, below which an error at the end says nothing.
-    """
-
-    what: str
+    what: str  # the state, or "position"
     unit: str
-    rms: float = float("nan")
-    most: float = float("nan")
-    at_s: float = float("nan")
+    rms: float = float("nan")  # over the whole run; NaN if only its end is weighed
+    most: float = float("nan")  # the largest error
+    at_s: float = float("nan")  # when that was, in seconds of the run
+    # rms of the errors at the last state; NaN if a run ended early, or if the end has no weight of
+    # its own and nothing is to be reached (see `reaches`)
     end: float = float("nan")
-    noise: float = 0.0
+    noise: float = 0.0  # std of a single sample, below which an error at the end says nothing
 
     @property
     def finding(self) -> Finding:

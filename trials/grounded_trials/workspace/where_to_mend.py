@@ -32,7 +32,7 @@ def hashed(files: Sequence[Path]) -> str:
 def where_to_mend(
     workspace: Folder, used: Sequence[Trial], findings: Sequence[Finding]
 ) -> tuple[Finding, ...]:
-    """Complete findings with the whole key of [log], or with advice if no trial was read by it."""
+    """Complete findings with the whole key of [log], or with none if no trial was read by it."""
     about = {one.stored.id: one.meta for one in workspace.trials()}
     fed = workspace.config.task.feedback
     read = [meta for trial in used if "source_sha256" in (meta := about[trial.id])]
@@ -50,15 +50,7 @@ def where_to_mend(
             replace(one, mend=either(one)) if fed and one.keys and late_effects([one]) else one
             for one in whole
         )
-    how = {"delay": "late", "lag": "late", "sign": "sign", "degrees": "degrees"}
-
-    def mended(one: Finding, way: str) -> Finding:
-        told = said.found("sensor.mend", one.signal, how=way, fed=fed and way == "late")
-        return replace(one, keys={}, mend=told)
-
-    return tuple(
-        mended(one, how[one.kind]) if one.corrected and one.kind in how else one for one in findings
-    )
+    return tuple(replace(one, keys={}) if one.corrected else one for one in findings)
 
 
 def _whole(finding: Finding, by: Mapping[str, Reading]) -> Mapping[str, Any]:

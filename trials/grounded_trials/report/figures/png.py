@@ -31,11 +31,6 @@ STYLE: Any = {
 def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIGH)) -> bytes:
     """Return the PNG file of a figure: its title, its panels, its legend, and its caption.
 
-    Args:
-        figure: the figure.
-        columns: panels side by side; 0: two, or three of more than four.
-        size: width and height of a panel [inch].
-
     Raises:
         GroundedError: if matplotlib is not installed.
     """

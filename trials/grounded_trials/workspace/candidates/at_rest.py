@@ -37,31 +37,19 @@ STEADY = 0.05  # fraction of a signal's range (or a rate's maximum) that counts 
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """Where a robot stood at the start of a trial.
+    """Where a robot stood at the start of a trial."""
 
-    Args:
-        states: their medians in the second half of that time (n,).
-        inputs: the same of the inputs (m,): a controller may sag at first.
-        steady: changes of the states that count as none (n,).
-        needs: inputs that hold it there (m,) bool: constant, or beyond what trembles. An input
-            without which the model moves less is none: a throttle held while the motors are off.
-        trial: its id.
-    """
-
-    states: Array
-    inputs: Array
-    steady: Array
+    states: Array  # (n,) their medians in the second half of that time
+    inputs: Array  # (m,) the same: a controller may sag at first
+    steady: Array  # (n,) changes of the states that count as none
+    # (m,) inputs that hold it there: constant, or beyond what trembles. An input without which the
+    # model moves less is none: a throttle held while the motors are off.
     needs: NDArray[np.bool_]
-    trial: str
+    trial: str  # its id
 
 
 def standstill(model: Model, trial: Trial) -> Stand | None:
-    """Return where the robot stands at the start of a trial; None if it moves there.
-
-    Args:
-        model: whose states they are.
-        trial: it may be the first part of a log.
-    """
+    """Return where the robot stands at the start of a trial; None if it moves there."""
     steps = max(LEAST_STEPS, round(STOOD / trial.dt))
     x, u = trial.states[: steps + 1], trial.inputs[:steps]
     if trial.steps <= steps or not (np.isfinite(x).all() and np.isfinite(u).all()):
@@ -200,15 +188,10 @@ NOISY = 0.02  # most utility that the noise of a state may cost at the end, by i
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """What makes the free states of a line rest at its end.
+    """What makes the free states of a line rest at its end."""
 
-    Args:
-        columns: of these states and their rates, (H + 1,) each; they count at the end only.
-        weights: for [reward] terminal, also of the states that the line has: a ball that arrives
-            too fast leaves a level beam as well.
-    """
-
-    columns: dict[str, Array]
+    columns: dict[str, Array]  # of these and their rates, (H + 1,); they count at the end only
+    # for [reward] terminal, also of the line's states: a fast ball leaves a level beam as well
     weights: dict[str, float]
 
 

@@ -41,11 +41,6 @@ def idle_inputs(task: Task, states: Array, inputs: Array) -> list[str]:
 
     An example is a gain that is still 0 in a model skeleton. A rudder acts only at some speed, and
     a plan may stay at rest: so the model is also probed at other states and inputs.
-
-    Args:
-        task: the task with the model and the limits.
-        states: where the model is probed too (N, n).
-        inputs: the inputs there (N, m).
     """
     some, sent = samples(task.model, 8)
     x = np.concatenate([states, some])

@@ -42,7 +42,6 @@ if TYPE_CHECKING:
     from grounded.figures.figure import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
-    from grounded_trials.workspace.identity import StoredTrial
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -212,7 +211,9 @@ def _handed_over(
     void: dict[str, str] = {}
     while True:
         seen = workspace.names()
-        proposal = _proposal(workspace, void, tick)
+        contents = workspace.read()  # as if the void ones had never been proposed
+        kept = tuple(one for one in contents.candidates if one.id not in void)
+        proposal = planned(workspace, replace(contents, candidates=kept), tick)
         candidate = proposal.candidate
         if candidate is None:
             return proposal, void
@@ -234,15 +235,6 @@ def _handed_over(
             void[candidate.id] = in_words(error.reasons)
         else:
             return replace(proposal, findings=(*proposal.findings, *handed.findings)), void
-
-
-def _proposal(
-    workspace: Folder, without: Collection[str], tick: Callable[[str], None] | None
-) -> Proposal:
-    """Ask the search for a proposal as if some (void) candidates had never been proposed."""
-    contents = workspace.read()
-    candidates = tuple(c for c in contents.candidates if c.id not in without)
-    return planned(workspace, replace(contents, candidates=candidates), tick)
 
 
 def _disowned(now: Standing, aside: Collection[str]) -> list[Finding]:
@@ -272,7 +264,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *([asked[1]] if asked else []),
         *gone,
         *filter(None, [overtaken(workspace)]),
-        *not_counted(uncounted(workspace, workspace.trials(), standing)),
+        *uncounted(workspace, standing),
         *left_out(workspace),
         *here.since.findings,
     ]
@@ -315,17 +307,12 @@ def status_in(workspace: Folder) -> Status:
     return status_of(workspace, standing_in(workspace, ahead=True))
 
 
-def uncounted(workspace: Folder, trials: Sequence[StoredTrial], now: Standing) -> list[str]:
-    """Return trials of this model that ran no candidate of the search.
+def uncounted(workspace: Folder, now: Standing) -> list[Finding]:
+    """Return which trials of this model only serve fit and diagnose; [] for none.
 
-    They ran one of another task, a probe, or another policy with the name of a candidate, after two
-    folders were merged.
+    They ran a candidate of another task, or a probe.
     """
-    own = {tried.candidate.id for tried in now.history}
-    ran = [one for one in trials if one.trial.candidate and workspace.fits(one.trial)]
-    return [one.stored.id for one in ran if one.trial.candidate not in own]
-
-
-def not_counted(names: Sequence[str]) -> list[Finding]:
-    """Return that these trials only serve fit and diagnose; [] for none."""
+    own = {"", *(tried.candidate.id for tried in now.history)}
+    fitting = (one for one in workspace.trials() if workspace.fits(one.trial))
+    names = [one.stored.id for one in fitting if one.trial.candidate not in own]
     return [found("search.uncounted", *names)] if names else []

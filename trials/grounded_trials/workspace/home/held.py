@@ -34,27 +34,16 @@ HINGE, SLIDE, JOINT = 3, 2, 0  # mjtJoint, mjTRN_JOINT
 
 @dataclass(frozen=True)
 class Number:
-    """A number of the file with its value now.
+    """A number of the file with its value now."""
 
-    Attributes:
-        kind: body, joint, actuator or geom.
-        index: of the element in MjModel.
-        name: of the element and the field, `elbow.damping`.
-        field: damping, mass, ...
-        value: its value now.
-        was: its value in the file.
-        std: its standard deviation, NaN if it is not known.
-        unit: of the three.
-    """
-
-    kind: str
-    index: int
-    name: str
+    kind: str  # body, joint, actuator or geom
+    index: int  # of the element in MjModel
+    name: str  # of the element and the field, `elbow.damping`
     field: str
-    value: float
-    was: float
-    std: float
-    unit: str
+    value: float  # now
+    was: float  # in the file
+    std: float  # NaN if it is not known
+    unit: str  # of the three
 
 
 class Held:

@@ -244,15 +244,12 @@ def _still(trial: Trial) -> Iterator[Finding]:
 
 def _beyond(workspace: Folder, trial: Trial) -> Iterator[Finding]:
     """Yield inputs that exceed [limits]: of data these were taken from another log."""
-    task, mapping, sent = workspace.task, workspace.log_mapping, np.nan_to_num(trial.inputs)
+    task, sent = workspace.task, np.nan_to_num(trial.inputs)
     slack = ROUNDED * np.abs(sent).max(axis=0, initial=0.0)
-    past, turned = (
-        np.maximum(task.low - u, u - task.high).max(axis=0, initial=0.0) for u in (sent, -sent)
-    )
+    past = np.maximum(task.low - sent, sent - task.high).max(axis=0, initial=0.0)
     for i in np.flatnonzero(past > slack):
         name, ends = trial.input_names[i], (float(task.low[i]), float(task.high[i]))
         unit = task.model.inputs[name]
-        flip = turned[i] <= slack[i] and mapping is not None and mapping.inputs[name].scale < 0
-        how = "clip" if trial.candidate else "flip" if flip else "widen"
+        how = "clip" if trial.candidate else "widen"
         limits = f"{ends[0]:.4g} to {with_unit(f'{ends[1]:.4g}', unit)}"
         yield found("log.limits", name, most=Quantity(float(past[i]), unit), limits=limits, how=how)

@@ -54,12 +54,6 @@ def sender_of(
 
     A neighbour of it sends commands that differ by a few percent, so each is computed from the
     samples of the age that fits best.
-
-    Args:
-        log: the log with the run.
-        own: the candidate that it is said to have run.
-        candidates: candidates that may have been run instead.
-        start_of: returns where a candidate's run seems to begin in the log.
     """
 
     def alike(one: Candidate, at: float) -> int | None:

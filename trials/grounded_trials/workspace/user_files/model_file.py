@@ -28,11 +28,7 @@ def load_module(
 ) -> ModuleType:
     """Load the module of a model, from a file in the workspace or by its import name.
 
-    Args:
-        folder: the workspace.
-        file: the file of the model, relative to the workspace.
-        module: its import name, or a name among the entry points, instead of a file.
-        key: the key of grounded.toml that named the file, for messages.
+    A name may be one among the entry points; `key` is that of grounded.toml, for messages.
 
     Raises:
         GroundedError: if it does not exist, lies outside the workspace, or fails while it runs.

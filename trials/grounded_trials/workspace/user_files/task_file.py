@@ -295,12 +295,7 @@ def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> lis
 
 
 def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
-    """Return the default weight on an input's changes, scaled by its range.
-
-    Args:
-        limits: lowest and highest value; None if unknown: -1 to 1, or -100 to 100 for unit %.
-        unit: the unit of the input.
-    """
+    """Return the default weight on an input's changes, by its range, or by its unit."""
     low, high = limits or FULL.get(unit, (-1.0, 1.0))
     return CHANGES / (high - low) ** 2 if high > low else CHANGE
 

@@ -198,10 +198,6 @@ def mapping_of(workspace: Folder, path: Path) -> LogMapping:
         return mapping
     if (path / FILE).is_file():
         raise refused("file.no_log", path, own=1)
-    own = [file for file in files if format_of(file)] if path.is_dir() else []
-    if own:
-        newest = str(max(own, key=lambda file: file.stat().st_mtime))
-        raise refused("file.no_log", path, own=1, then=NextCommand("ingest", (newest,)))
     read_apart(files, _first_records)
     raise refused("file.no_mapping", path, then=NextCommand("inspect", (str(path),)))
 

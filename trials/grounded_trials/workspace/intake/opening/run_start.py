@@ -370,11 +370,6 @@ def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
 def _aged(log: Recording, start: int, steps: int) -> tuple[list[list[int]], list[Array]]:
     """Return the states of a log at all ages that they may have had when commands were sent.
 
-    Args:
-        log: the log.
-        start: when the run begins, in ns after the log's first sample.
-        steps: of the run, T.
-
     Returns:
         The groups of states with the same time stamps, which are equally old; and the states,
         (ages, T, n): held from sample to sample (but for those that were estimated), and between.

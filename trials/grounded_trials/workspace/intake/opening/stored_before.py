@@ -31,12 +31,6 @@ def refuse_as_another(
 ) -> None:
     """Refuse a log that is stored as a run of another candidate, or as data.
 
-    Args:
-        workspace: the workspace with the search.
-        path: the log.
-        stored: the trials that were made from it.
-        wanted: the requested candidate, "" for data, None for any run.
-
     Raises:
         GroundedError: if it is stored as something else.
     """
