@@ -26,7 +26,7 @@ from grounded.findings import Finding, Quantity, Weight, found, settle
 from grounded.result import NULL, UNSAID, Document, with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
-from grounded.trial import Trial
+from grounded.trial import HUGE, Trial
 from grounded_trials.store.own_files import CANDIDATE, TRIAL, format_of
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
@@ -207,6 +207,10 @@ def _checked(run: Run) -> Iterator[Finding]:
     if filled.samples:
         longest, at = Quantity(filled.longest_s, "s"), Quantity(filled.at_s, "s")
         yield found("log.gaps", filled.state, samples=filled.samples, longest=longest, at=at)
+    if whole.finite_steps < whole.steps:
+        name, step = _first_bad(whole)
+        ends = Quantity(step * whole.dt, "s") if step else "its start"
+        yield found("file.vanished", name, ends=ends)
     if not whole.candidate:
         yield from _still(whole)
         yield from _beyond(run.workspace, whole)
@@ -215,6 +219,18 @@ def _checked(run: Run) -> Iterator[Finding]:
     if np.ptp(run.own.predicted_states, axis=0).any():
         yield from _still(run.run)
     yield from _unsafe(task, run.run, run.own)
+
+
+def _first_bad(trial: Trial) -> tuple[str, int]:
+    """Return the first state or input that is not a finite number, and its step."""
+    places = [
+        (int(step), name)
+        for values, names in ((trial.states, trial.state_names), (trial.inputs, trial.input_names))
+        for column, name in zip(values.T, names, strict=True)
+        for step in np.flatnonzero(~(np.abs(column) < HUGE))[:1]
+    ]
+    step, name = min(places, key=lambda place: place[0])
+    return name, step
 
 
 def _unsafe(task: Task, trial: Trial, ran: Candidate) -> Iterator[Finding]:
