@@ -34,19 +34,16 @@ def adopt(effects: tuple[str, ...], effect_only: bool, undo: bool) -> Iterator[A
     yield done
     if undo:
         sentence(f"undone: {', '.join(done.undone)} ({file})")
-        now = workspace.base_model.params
-        values = {k: now[k].value for k, was in before.items() if was.value != now[k].value}
-        jointly: tuple[str, ...] = ()
-    else:
-        values, jointly = dict(done.params), done.jointly
-        for name in dict.fromkeys((*effects, *done.along)):
-            show(field("adopted", f"{name}{ALONE * (name in jointly)}"))
-        tell(done.findings)
+    for name in dict.fromkeys((*effects, *done.along)):
+        show(field("adopted", f"{name}{ALONE * (name in done.jointly)}"))
+    tell(done.findings)
+    now = workspace.base_model.params
+    values = [name for name, was in before.items() if was.value != now[name].value]
     if values:
         show("[model] params:")
-    for name, value in values.items():
-        text = moved(before[name].value, value, before[name].unit, DIGITS)
-        show(field(name, text + ALONE * (name in jointly), "  "))
+    for name in values:
+        text = moved(before[name].value, now[name].value, now[name].unit, DIGITS)
+        show(field(name, text + ALONE * (name in done.jointly), "  "))
     known = numbers_in(workspace)
     if changed := {name: one for name, one in known.items() if were.get(name, one) != one}:
         show("[model] effects:")

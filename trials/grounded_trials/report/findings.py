@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from grounded.findings import found
 from grounded.frozen import Array
 from grounded.result import begun
 from grounded.search.candidate import Candidate, Tried
+from grounded.search.pictures import few
 from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
@@ -34,7 +35,6 @@ from grounded_trials.workspace.off_target import tracking_error
 if TYPE_CHECKING:
     from grounded_trials.workspace.adoption import Better
 
-One = TypeVar("One")
 ESTIMATED = "not measured: an estimate"  # note at a panel
 
 
@@ -165,11 +165,10 @@ class Findings:
         """The latest run of the best candidate, else the latest run."""
         return self.best or (self.runs[-1] if self.runs else None)
 
-    @cached_property
-    def improvements(self) -> tuple[Run, ...]:
-        """A run of each accepted candidate, by iteration, starting with the model's policy."""
-        found = [self._latest(tried) for tried in self.history if tried.accepted]
-        return tuple(run for run in found if run is not None)
+    def improvements(self, most: int) -> list[Run]:
+        """Return a run of at most `most` accepted candidates, the model's policy first."""
+        kept, _ = few([tried for tried in self.history if tried.accepted], most)
+        return [run for run in map(self._latest, kept) if run is not None]
 
     def tried_of(self, run: Run) -> Tried:
         """Return a run's candidate with all its trials."""
@@ -215,11 +214,3 @@ def rms(parts: Sequence[Array]) -> Array:
     count = finite.sum(axis=0)
     total = (np.where(finite, values, 0.0) ** 2).sum(axis=0)
     return np.asarray(np.sqrt(np.where(count > 0, total / np.maximum(count, 1), np.nan)))
-
-
-def selection(runs: Sequence[One], most: int) -> tuple[One, ...]:
-    """Return at most `most` of them: the first, the last, and evenly spaced ones between."""
-    if len(runs) <= most:
-        return tuple(runs)
-    index = np.unique(np.rint(np.linspace(0, len(runs) - 1, most)).astype(int))
-    return tuple(runs[i] for i in index)

@@ -31,7 +31,6 @@ from grounded_trials.report.findings import (
     Run,
     compared,
     prediction_error,
-    selection,
 )
 from grounded_trials.wording import figure, labelled, per_second, shown
 from grounded_trials.workspace.off_target import asked_for, tracked, tracking_error
@@ -136,7 +135,7 @@ def input_figure(findings: Findings) -> Figure | None:
 def bias_figure(findings: Findings) -> Figure | None:
     """Return the figure of the crude model's bias along the run, by iteration."""
     task, best = findings.task, findings.best
-    runs = selection(findings.improvements, ITERATIONS)
+    runs = findings.improvements(ITERATIONS)
     if not runs:
         return None
     roles = ["model", *(STEPS[k % 3] for k in range(len(runs) - 2)), "best"][: len(runs)]

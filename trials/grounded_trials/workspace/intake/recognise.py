@@ -33,6 +33,7 @@ from grounded.accounts.returned import (
 )
 from grounded.accounts.sent import follows, latest
 from grounded.accounts.table import Account
+from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.search.candidate import Candidate
@@ -185,8 +186,9 @@ def recognised(workspace: Folder, path: Path, read: Read, candidate: str | None)
     cases = [Case(workspace, path, read, log) for log in logs]
     case = min(cases, key=lambda one: one.doubt)
     read, fell = case.read, case.fell
-    if read.log and read.cut:
-        read.log.refuse_late(read.cut)
+    if read.cut and read.cut.late_s > case.task.dt / 2:  # a state is not known when it begins
+        after = Quantity(read.cut.late_s, "s")
+        raise refused("log.late_states", where=str(path), late=after)
     stored = read.log.stored if read.log else ()
     if accepted := [one.trial.steps for one in stored if one.trial.candidate == ran]:
         return cut_short(read, fell[0]) if fell and fell[0] in accepted else read

@@ -16,7 +16,7 @@ import numpy as np
 
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, Quantity, found
+from grounded.findings import Finding, found
 from grounded.model import Model
 from grounded.places import integrals
 from grounded.trial import Trial
@@ -109,17 +109,6 @@ class ForeignLog:
             start_states=found.start_states if candidate else {},
         )
         return trial, found
-
-    def refuse_late(self, grid: Gridded) -> None:
-        """Refuse a candidate's run if its beginning was not recorded.
-
-        Raises:
-            GroundedError: if a state is not known when the run begins.
-        """
-        dt = self.workspace.config.task.dt
-        if grid.late_s > dt / 2:
-            late = Quantity(grid.late_s, "s")
-            raise GroundedError(found("log.late_states", where=str(self.path), late=late))
 
     @cached_property
     def stored(self) -> tuple[StoredTrial, ...]:
