@@ -27,7 +27,6 @@ from grounded_trials.logs.log_table import LogMapping, log_mapping, mapped_signa
 from grounded_trials.logs.resample import Gridded, Span, to_grid
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signals import Series, read_signals
-from grounded_trials.store.own_files import format_of
 from grounded_trials.workspace.adopted import but_late_sensors, planner_of
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import (
