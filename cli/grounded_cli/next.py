@@ -26,9 +26,8 @@ def following(log: str, candidate: str | None, details: bool) -> Iterator[NextRu
     show("")
     tell_proposed(done.proposed)
     if done.exported is None:
-        show(f"\n{next_line(done.proposed.then)}")
-    if done.exported is not None:
-        files = filter(None, (done.exported.file, done.exported.runner))
-        show(field("files", ", ".join(map(str, files)), "  "))
-        tell([found("search.to_robot", done.exported.candidate)], all_=True)
-        show(next_line(NextCommand("next", ("LOG",))))
+        return show(f"\n{next_line(done.proposed.then)}")
+    files = filter(None, (done.exported.file, done.exported.runner))
+    show(field("files", ", ".join(map(str, files)), "  "))
+    tell([found("search.to_robot", done.exported.candidate)], all_=True)
+    show(next_line(NextCommand("next", ("LOG",))))

@@ -36,7 +36,7 @@ from grounded.trial import Trial, mean_trial
 from grounded_trials.wording import what_became
 from grounded_trials.workspace.candidates.search_state import standing_of
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.identity import StoredTrial, candidate_of, other_task, sha256
+from grounded_trials.workspace.identity import candidate_of, other_task, sha256
 from grounded_trials.workspace.readings import twice_in_time
 
 if TYPE_CHECKING:
@@ -154,11 +154,6 @@ class Check:
     now: Standing | None
 
     @cached_property
-    def trials(self) -> tuple[StoredTrial, ...]:
-        """The trials whose files are intact."""
-        return self.workspace.whole_trials()
-
-    @cached_property
     def standing(self) -> Standing:
         """The standing of the search."""
         return self.now or standing_of(self.workspace, self.workspace.read(strict=False))
@@ -186,7 +181,7 @@ class Check:
         file, then = f"candidates/{made.id}.mcap", PROPOSE
         if found_hash not in self.workspace.noted.handed.get(made.id, {found_hash}):
             raise GroundedError(found("file.changed", file, then=then, what="candidate"))
-        for one in self.trials:
+        for one in self.workspace.whole_trials():
             if one.trial.candidate == made.id and one.ran not in ("", found_hash):
                 ran = one.stored.id
                 raise GroundedError(found("file.changed", file, then=then, what="policy", lost=ran))
@@ -204,7 +199,7 @@ class Check:
                     wanted = own_units[signal]
                     yield found("given.fit", signal, what="unit", theirs=unit, own=wanted)
         yield from outside_limits(self.workspace.task, made.policy)
-        if not self.same_task and not (self.other_task and self._ever_ran):
+        if not self.same_task and not (self.other_task and self._ran):
             yield found(
                 "plan.other_task",
                 name,
@@ -218,7 +213,7 @@ class Check:
     def notes(self) -> Iterator[Finding | None]:
         """Yield what the user should know although it does not prevent its use."""
         made, name, best = self.candidate, self.candidate.id, self.standing.incumbent
-        if best is not None and not self._trials(name):
+        if best is not None and not self._runs:
             yield in_question(made, best, self.workspace.config.search.repeats)
         yield from self._became()
         if not self.same_task:
@@ -248,19 +243,21 @@ class Check:
     def void(self) -> bool:
         """Whether it is a step of the search, planned with another model, that no trial ran."""
         searched = self.meta.get("kind") == "search" and self.same_task
-        return searched and not self._trials(self.candidate.id) and self._changed
+        return searched and not self._runs and self._changed
 
     @property
     def _changed(self) -> bool:
         return self.candidate.model != self.workspace.planner.fingerprint
 
-    @property
-    def _ever_ran(self) -> bool:
-        return any(one.trial.candidate == self.candidate.id for one in self.trials)
+    @cached_property
+    def _ran(self) -> list[Trial]:
+        """Its runs, also those that no longer fit the task, whose files are intact."""
+        every = (one.trial for one in self.workspace.whole_trials())
+        return [trial for trial in every if trial.candidate == self.candidate.id]
 
-    def _trials(self, identity: str) -> list[Trial]:
-        found = [t.trial for t in self.trials if t.trial.candidate == identity]
-        return [t for t in found if self.workspace.fits(t)]
+    @property
+    def _runs(self) -> list[Trial]:
+        return [trial for trial in self._ran if self.workspace.fits(trial)]
 
     def _unsafe(self) -> tuple[Finding, ...]:
         """Return objections of [safety]; a step not run yet gets a margin for how runs strayed.
@@ -269,7 +266,7 @@ class Check:
         """
         made, task, strays = self.candidate, self.workspace.task, None
         same = made.policy.horizon == task.horizon and abs(made.policy.dt - task.dt) <= 1e-9
-        runs = [one.until(task.horizon) for one in self._trials(made.id)]
+        runs = [one.until(task.horizon) for one in self._runs]
         whole = [one for one in runs if one.finite_steps == task.horizon]
         if self._changed and same and whole:
             mean = mean_trial(whole, task.model.angle_mask)

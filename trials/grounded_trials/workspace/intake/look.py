@@ -26,7 +26,7 @@ from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
 from grounded_trials.workspace.intake.opening.run_start import ActedOn, Recording, Start, acted_on
 
-LOOSE = 0.1  # uncertainty of a start, in steps, above which it is another, or is told
+LOOSE = 0.1  # distance from the first command, in steps, above which it is another start
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
