@@ -99,7 +99,7 @@ def propose(
     fingerprint = planner.fingerprint
 
     # Steps 3, 6 and 7: where the search stands by the trials of the real system.
-    now = standing(task, candidates, trials, options, fingerprint, planner)
+    now = standing(task, candidates, trials, options, fingerprint)
     if now.phase is not Phase.PROPOSE:
         return Proposal(now, now.outstanding, is_new=False)
 

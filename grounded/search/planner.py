@@ -12,9 +12,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -48,14 +48,12 @@ class Planner:
         widths: names of parameters of the planning model that are speeds over which a dry friction
             builds up.
         plays: names of its parameters that are widths of a play.
-        memory: what was found last with this model about trials (`standing`).
     """
 
     task: Task
     plan: Task
     widths: tuple[str, ...] = ()
     plays: tuple[str, ...] = ()
-    memory: dict[str, Any] = field(default_factory=dict, repr=False)
 
     @cached_property
     def fingerprint(self) -> str:

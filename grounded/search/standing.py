@@ -18,11 +18,10 @@ a state with what to run next.
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
@@ -34,9 +33,6 @@ from grounded.search.pictures import search_figure
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
-
-if TYPE_CHECKING:
-    from grounded.search.planner import Planner
 
 
 class Phase(StrEnum):
@@ -258,7 +254,6 @@ def standing(
     trials: Sequence[Trial],
     options: SearchOptions,
     model: str,
-    planner: Planner | None = None,
 ) -> Standing:
     """Derive the state of the search from stored trials (steps 6 and 7).
 
@@ -268,13 +263,8 @@ def standing(
         trials: in order of storage; those of unknown candidates are ignored.
         options: the [search] table.
         model: fingerprint of the current planning model; a direction belongs to one model.
-        planner: remembers what was found; None: it is found again.
     """
-    of = [task, options, model, *candidates, *trials]
-    memory = planner.memory if planner else {}
-    if not _same(memory.get("of", ()), of):
-        memory.update(of=of, found=judged(task, candidates, trials, options, model))
-    history, incumbent, iteration = memory["found"]
+    history, incumbent, iteration = judged(task, candidates, trials, options, model)
     total = sum(len(t.trials) for t in history)
     now = Standing(
         phase=Phase.PROPOSE,
@@ -309,11 +299,6 @@ def standing(
     improve = found("search.step", own, best=own, step=str(step), crashed=crashed)
     now = replace(now, step=step, findings=(improve,))
     return now.with_finding(_suspicion(history, incumbent, model))
-
-
-def _same(one: Sequence[object], other: Sequence[object]) -> bool:
-    """Check whether two lists hold the same objects."""
-    return len(one) == len(other) and all(map(operator.is_, one, other))
 
 
 def ended(now: Standing, ending: Ending, *findings: Finding) -> Standing:

@@ -274,7 +274,7 @@ class Story:
 
     @property
     def now(self):
-        return standing(TASK, *self.both, self.options, PLANNER.fingerprint, PLANNER)
+        return standing(TASK, *self.both, self.options, PLANNER.fingerprint)
 
 
 @pytest.fixture

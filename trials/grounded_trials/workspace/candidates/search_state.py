@@ -60,13 +60,12 @@ def standing_in(
 
 def standing_of(workspace: Folder, contents: Contents, without: Collection[str] = ()) -> Standing:
     """Return the standing of the search by what a folder holds, without some trials."""
-    task, options, planner = workspace.task, workspace.config.search, workspace.planner
+    task, options = workspace.task, workspace.config.search
     if (key := frozenset(without)) not in contents.standings:
         trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
         trials = [trial for trial in trials if trial.id not in without]
-        contents.standings[key] = standing(
-            task, contents.candidates, trials, options, planner.fingerprint, planner
-        )
+        known = (task, contents.candidates, trials, options)
+        contents.standings[key] = standing(*known, workspace.planner.fingerprint)
     return contents.standings[key]
 
 
