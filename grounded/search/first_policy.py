@@ -8,10 +8,9 @@ starts, and the plan with the lowest cost is taken:
     reference        a closed-loop run of the model near the target (`first_guess`)
     constant inputs  zero, and the inputs held before the start if they differ
     smooth inputs    random, with fixed seeds; only for compiled models, which solve in milliseconds
-    more starts      if those found several local optima of similar cost: random inputs, and the
-                     best plan so far with a disturbance ("kick"), which leads to other optima
-    early plans      every other one of these: plans that reach the final state early and stay
-                     there. The optimum of a quick swing-up is too narrow to be found by chance
+    early plans      if those found several local optima of similar cost: plans from random inputs
+                     that reach the final state early and stay there. The optimum of a quick
+                     swing-up is too narrow to be found by chance
 
 A simulator (`System.simulated`) takes a second an iteration. There a plan is improved until an
 iteration promises less than ROUGH of its cost or gains less than ROUGH^2 of what standing still
@@ -39,10 +38,9 @@ CAUTION = 100.0  # factor on the input penalties for each crash of the first pol
 ITERATIONS = 1000  # most iterations of DDP from one start
 AT_ONCE = 2e5  # control steps times iterations between two chances to interrupt: under a second
 STARTS = 24  # random starts
-FURTHER_STARTS = 300  # further starts if there are local optima
+FURTHER_STARTS = 150  # further starts if there are local optima
 KNOTS = (5, 8, 14)  # knots of a random start's inputs, in turn
 AMPLITUDES = (0.05, 0.15, 0.4)  # standard deviation of the knots, as a share of the input's range
-KICK, KICKED = 0.3, (5.0, 40.0)  # height of a kick as in AMPLITUDES; range of its width in steps
 EARLY = (0.3, 0.8)  # shares of the task after which an early plan has to be in the final state
 STAYED = 100  # iterations for such a plan
 WORSE = 1.01  # factor of the best cost above which a plan counts as another optimum
@@ -122,20 +120,16 @@ def cautious(task: Task, caution: int) -> Task:
 def _hopped(
     task: Task, problem: Problem, best: ddp.Solution, most: int, tick: Tick | None
 ) -> ddp.Solution:
-    """Return the best plan of many more starts; most are dropped before they converge."""
+    """Return the best of many early plans; most are dropped before they converge."""
     rng, size = np.random.default_rng(STARTS), problem.horizon * (problem.nz + task.model.m) ** 2
     work = MORE_WORK
     for i in range(FURTHER_STARTS):
-        if i % 2:
-            early = _early(task, problem, rng, i // 2)
-            work -= size * len(early.trace)
-            start = (early.u, early.K, early.z[:-1])
-            found = finished(problem, *start, most=SKETCH, tick=tick) if early.ok else None
-        else:
-            inputs = _random(task, rng, i // 4) if i % 4 else _kicked(task, rng, best.u)
-            found = _pursued(problem, (inputs, None, None), best, SKETCH, tick)
-        work -= size * (len(found.trace) if found else 1)
-        if found is not None and found.status == "max iterations":
+        early = _early(task, problem, rng, i)
+        work -= size * len(early.trace)
+        start = (early.u, early.K, early.z[:-1])
+        found = finished(problem, *start, most=SKETCH, tick=tick) if early.ok else early
+        work -= size * len(found.trace)
+        if found.status == "max iterations":
             if found.cost > PROMISING * best.cost:
                 continue
             found = finished(problem, found.u, found.K, found.z[:-1], most=most, tick=tick)
@@ -238,26 +232,13 @@ def _rivals(task: Task) -> Iterator[Array]:
         yield np.clip(zero + smooth, task.low, task.high)
 
 
-def _random(task: Task, rng: np.random.Generator, i: int) -> Array:
-    """Return larger random inputs (H, m), of four kinds in turn."""
-    smooth = _smooth(task, rng, KNOTS[1 + i % 2], AMPLITUDES[1 + i // 2 % 2])
-    return np.clip(smooth, task.low, task.high)
-
-
 def _early(task: Task, problem: Problem, rng: np.random.Generator, i: int) -> ddp.Solution:
     """Return a plan in which all states from a random step on have at least the final weights."""
     weight, begin = problem.state_weight.copy(), int(task.horizon * rng.uniform(*EARLY))
     weight[begin:] = np.maximum(weight[begin:], weight[-1])
-    inputs = _random(task, rng, i)
+    smooth = _smooth(task, rng, KNOTS[1 + i % 2], AMPLITUDES[1 + i // 2 % 2])
+    inputs = np.clip(smooth, task.low, task.high)
     return finished(replace(problem, state_weight=weight), inputs, most=STAYED)
-
-
-def _kicked(task: Task, rng: np.random.Generator, inputs: Array) -> Array:
-    """Return the inputs (H, m) with a smooth disturbance at a random time."""
-    at, width = rng.uniform(0, task.horizon), rng.uniform(*KICKED)
-    height = rng.normal(0.0, KICK, task.model.m) * _range(task)
-    shape = np.exp(-0.5 * ((np.arange(task.horizon)[:, None] - at) / width) ** 2)
-    return np.asarray(np.clip(inputs + height * shape, task.low, task.high))
 
 
 def _smooth(task: Task, rng: np.random.Generator, count: int, amplitude: float) -> Array:
