@@ -81,3 +81,20 @@ def test_no_plan_is_made_for_an_input_that_log_does_not_map(tmp_path):
     file.write_text(without)
     with pytest.raises(GroundedError, match=r"maps no .*duty"):
         Workspace(w).propose()
+
+
+def test_the_input_that_holds_a_robot_at_the_start_of_its_log_is_that_before_a_run(tmp_path):
+    """A hover at 2 m, then a climb: at rest 0.8 of the thrust is needed."""
+    text = "from grounded import Model, Param\nmodel = Model(\n"
+    text += '    states={"z": "m", "w": "m/s"}, inputs={"thrust": "1"},\n'
+    text += '    params={"k": Param(12.2625, "m/s^2", 5, 20)},\n'
+    text += '    derivative=lambda s, a, p: {"z": s.w, "w": p.k * a.thrust - 9.81},\n)\n'
+    (tmp_path / "m.py").write_text(text)
+    t = DT * np.arange(500)
+    thrust = 0.8 + 0.1 * np.where(t > 2, np.sin(3 * (t - 2)), 0.0)
+    w = np.concatenate([[0.0], np.cumsum(DT * (12.2625 * thrust - 9.81))[:-1]])
+    z = 2.0 + np.concatenate([[0.0], np.cumsum(DT * w)[:-1]])
+    rows = np.column_stack([t, z, w, thrust])
+    np.savetxt(tmp_path / "a.csv", rows, "%.5f", ",", header="t,z,w,thrust", comments="")
+    begin(tmp_path / "w", tmp_path / "a.csv", model=tmp_path / "m.py")
+    assert Workspace(tmp_path / "w").task.past.tolist() == [0.8]

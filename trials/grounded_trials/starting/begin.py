@@ -32,7 +32,7 @@ from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
 from grounded_trials.starting.examples import fresh_folder
-from grounded_trials.starting.first_toml import write_first
+from grounded_trials.starting.first_toml import held_first, write_first
 from grounded_trials.starting.kinds import (
     COMMANDED,
     KINDS,
@@ -180,10 +180,11 @@ def begin(
 
         # The files: the target is read from the log as its [log] table says.
         table = mapping_toml(states, commands, simulated=report.simulated, layout=layout)
-        columns, sampled, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
+        columns, sent, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
         horizon = len(next(iter(columns.values()))) - 1
         name, why = Path(log).name, drawn.why
-        write_first(folder, made, step, columns, horizon, ranges, table, why, name)
+        stood = held_first(made, columns, sent, step)
+        write_first(folder, made, step, columns, horizon, ranges, table, why, name, stood)
         more = [*_on_own(report, (*states, *commands), made)] if own else []
         return Begun(
             workspace=str(folder),
@@ -194,7 +195,7 @@ def begin(
             horizon=horizon,
             states=tuple(states),
             inputs=tuple(commands),
-            target=f"{horizon * step:.3g} s of the log" if sampled else "zeros",
+            target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
             findings=(*notes, *drawn.notes, *more, *odd_run),
         )
 
@@ -351,8 +352,8 @@ def _recorded(
     model: Model,
     states: Sequence[Guess],
     dt: float,
-) -> tuple[dict[str, Array], bool, tuple[Finding, ...]]:
-    """Return the states (H + 1,) of a log's run, whether it has one, and what is odd about it.
+) -> tuple[dict[str, Array], dict[str, Array], tuple[Finding, ...]]:
+    """Return the states (H + 1,) and inputs (H,) of a log's run, and what is odd about it.
 
     The run begins where `ingest --data` lets it begin. For one that can't be sampled a placeholder
     is returned.
@@ -377,5 +378,6 @@ def _recorded(
         )
     except GroundedError as error:
         zeros = {model.state_names[0]: np.zeros(HORIZON + 1)}
-        return zeros, False, (error.finding.weighing(Weight.NOTE),)
-    return dict(zip(measured, grid.states.T, strict=True)), True, grid.findings
+        return zeros, {}, (error.finding.weighing(Weight.NOTE),)
+    columns = dict(zip(measured, grid.states.T, strict=True))
+    return columns, dict(zip(mapping.inputs, grid.inputs.T, strict=True)), grid.findings

@@ -6,10 +6,15 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from grounded.frozen import Array
 from grounded.model import Model
+from grounded.trial import Trial
+from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
+from grounded_trials.workspace.candidates.at_rest import standstill
 from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import FILE, OFFERED
 from grounded_trials.workspace.user_files.task_file import change_weight, write_target
@@ -76,6 +81,7 @@ def write_first(
     table: str,
     why: str,
     log: str,
+    held: Mapping[str, float],
 ) -> None:
     """Write grounded.toml and target.csv.
 
@@ -89,6 +95,8 @@ def write_first(
         table: the [log] table, as text.
         why: why this kind of robot was chosen.
         log: name of the log file.
+        held: states in which the robot stood at the start of the log, and the inputs that held it
+            there; may be {}.
     """
     write_target(folder / "target.csv", dt, dict(columns))
     weights = usual_weights(model, columns)
@@ -113,7 +121,7 @@ def write_first(
         model="",
         dt=number(dt),
         horizon=horizon,
-        start="{ }",
+        start=inline({name: _rounded(value) for name, value in held.items()}),
         feedback="true",
         latency=inline({name: _rounded(value) for name, value in late.items()}),
         weights=WEIGHTS.format(state=state, terminal=terminal, changes=change),
@@ -122,6 +130,27 @@ def write_first(
         rest=table.rstrip(),
     )
     write_atomically(folder / FILE, text.encode())
+
+
+def held_first(
+    model: Model, columns: Mapping[str, Array], sent: Mapping[str, Array], dt: float
+) -> dict[str, float]:
+    """Return the states in which a robot stands at the start of a log, and the inputs holding it.
+
+    {} if it moves, and for one that drives in a plane without an input: it may start anywhere.
+    """
+    if set(sent) != set(model.inputs) or set(columns) != set(model.states):
+        return {}
+    x = np.column_stack([columns[name] for name in model.state_names])
+    u = np.column_stack([sent[name] for name in model.input_names])
+    stand = standstill(model, Trial(x, u, dt, model.state_names, model.input_names))
+    if stand is None or not any(unit.endswith("/s") for unit in model.states.values()):
+        return {}
+    inputs = zip(model.input_names, stand.inputs.tolist(), stand.needs, strict=True)
+    held = {name: u for name, u, needed in inputs if needed}
+    where = zip(model.states.items(), stand.states.tolist(), stand.steady, strict=True)
+    away = {n: x for (n, unit), x, near in where if not unit.endswith("/s") and abs(x) > near}
+    return away | held if held or not has_plane(model) else {}
 
 
 def _span(ends: Sequence[float]) -> str:
