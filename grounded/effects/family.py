@@ -59,8 +59,6 @@ class Quantity:
         fixed: whether it is a constant of the effect, not estimated; its value is `start`.
         start: value at which the effect vanishes (if fixed: the value itself).
         places: number of independent values in the grid, for the price of the search.
-        tunable: whether it is a constant (above zero) that is fitted if the effect is large.
-        tuned: whether that was done.
         absurd: size above which it is not claimed, as it indicates wrong units or mixed-up logs.
         known: the value that the model already has; the estimate is a change of it. 0: none.
     """
@@ -73,8 +71,6 @@ class Quantity:
     fixed: bool = False
     start: float = 0.0
     places: float = 1.0
-    tunable: bool = False
-    tuned: bool = False
     absurd: float = np.inf
     known: float = 0.0
 
@@ -156,13 +152,10 @@ def from_source(s: Any, a: Any, site: Site) -> Any:
 def width(site: Site, speed: str) -> Quantity:
     """Return the speed over which a dry friction builds up: a hundredth of the largest speed.
 
-    It may be fitted, up to three tenths of the largest speed; a wider one would be a viscous
-    friction.
+    A wider one than three tenths of the largest speed would be a viscous friction.
     """
     peak, unit = site.scales.peak(speed), site.unit(speed)
-    return Quantity(
-        "width", unit, (), 1e-3 * peak, 0.3 * peak, fixed=True, start=0.01 * peak, tunable=True
-    )
+    return Quantity("width", unit, (), 1e-3 * peak, 0.3 * peak, fixed=True, start=0.01 * peak)
 
 
 def two_axes(unit: str) -> tuple[Quantity, ...]:
@@ -379,11 +372,9 @@ class Effect:
         """The constants."""
         return {q.name: q.start for q in self.quantities if q.fixed}
 
-    def tuned(self, name: str, value: float) -> Effect:
-        """Return the same effect with another value of a constant."""
-        new = (
-            replace(q, start=value, tuned=True) if q.name == name else q for q in self.quantities
-        )
+    def with_constants(self, values: Mapping[str, float]) -> Effect:
+        """Return the same effect with other values of constants."""
+        new = (replace(q, start=values[q.name]) if q.fixed else q for q in self.quantities)
         return replace(self, quantities=tuple(new))
 
     @property

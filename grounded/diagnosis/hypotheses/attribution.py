@@ -20,12 +20,7 @@ from grounded.diagnosis.hypotheses.search import (
     TO_THE_TOP,
     HypothesisSearch,
 )
-from grounded.diagnosis.hypotheses.variations import (
-    HOPEFUL,
-    TUNED,
-    tune,
-    varied,
-)
+from grounded.diagnosis.hypotheses.variations import HOPEFUL, varied
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data, fewer
 from grounded.diagnosis.likelihood.fitted import Fitted
@@ -38,6 +33,7 @@ from grounded.result import listed
 USUAL_EFFECTS = 3  # most effects searched for at first
 SOME = 8  # effects that are tried beside others
 RIVALS, BEHIND = 3, 25.0  # single effects that are extended, at most so many nats behind the best
+TOP = 2  # best larger sets that are fitted to convergence, and with parameters free
 ROUNDS = 2  # most rounds of convergence, since others may become the likeliest
 
 
@@ -137,7 +133,6 @@ def _explore(search: HypothesisSearch, limit: int | None) -> Fitted:
     search.structures(best)
     search.calibrated(best)
     search.refined(search.of_size(1)[:HOPEFUL], TO_THE_TOP)
-    tune(search, search.of_size(1)[:TUNED])
     return max([search.of_size(1)[0], search.best_null()], key=search.score)
 
 
@@ -159,9 +154,8 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
             search.extended(start, SOME)
         size += 1
         search.refined(search.of_size(size)[:HOPEFUL], 10)
-        search.refined(search.of_size(size)[:TUNED], TO_THE_TOP)
-        tune(search, search.of_size(size)[:TUNED])
-        for fit in search.of_size(size)[:TUNED]:
+        search.refined(search.of_size(size)[:TOP], TO_THE_TOP)
+        for fit in search.of_size(size)[:TOP]:
             search.calibrated(fit)
         larger = search.of_size(size)
         if not larger or search.score(larger[0]) < search.score(best) + NATS:

@@ -214,8 +214,7 @@ def price(data: Data, effect: Effect, values: Mapping[str, float], targets: int 
     each = ((q, values.get(q.name, 0.0)) for q in effect.free)
     if any(abs(v) > q.absurd or (q.grid and v >= q.high) for q, v in each):
         return math.inf
-    numbers = len(effect.free) + sum(q.tuned for q in effect.quantities)
-    cost = 0.5 * numbers * math.log(max(data.steps, 2)) + effect.family.vague
+    cost = 0.5 * len(effect.free) * math.log(max(data.steps, 2)) + effect.family.vague
     cost += _of_less_friction(effect, values)
     return cost + math.log(effect.places) + math.log(targets)
 

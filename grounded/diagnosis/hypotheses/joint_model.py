@@ -24,7 +24,7 @@ from grounded.diagnosis.hypotheses.search import (
     HypothesisSearch,
     Start,
 )
-from grounded.diagnosis.hypotheses.variations import LATE, tune, varied
+from grounded.diagnosis.hypotheses.variations import LATE, varied
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -65,7 +65,6 @@ def joint_model(search: HypothesisSearch) -> Fitted | None:
     if len(best.hypothesis.effects) < MANY_JOINTS:
         return None  # adding one at a time finds them, too
     if not simulated(search.data.model):
-        tune(search, [best])
         best = max(search.of_size(len(best.hypothesis.effects)), key=search.score)
     best = _completed(search, best, len(best.hypothesis.effects) + BEYOND)
     return _coloured(search, varied(search, best))

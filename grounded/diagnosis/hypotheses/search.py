@@ -29,7 +29,6 @@ from grounded.effects import (
     Effect,
     ParamFamily,
     SensorDelayFamily,
-    SensorLagFamily,
     acting_order,
     one_friction,
 )
@@ -278,9 +277,6 @@ class HypothesisSearch(FittedHypotheses):
             more = [fit.hypothesis.plus(look.effect, v) for v in (look.values, *look.others)]
             more += first(self.predictor, more[0])
             starts += [(h, fit.noise, fit.track) for h in more]
-            if isinstance(look.effect.family, SensorLagFamily):
-                # the signal before a sensor's filter is much faster, and so is its noise
-                starts.append(self.anew(fit, look.effect, look.values))
         for effect in self.together if late else ():
             if not delayed([effect]) & delayed(fit.hypothesis.effects):
                 starts += [self.anew(fit, effect, {"d": d}) for d in effect.free[0].grid[LATE]]

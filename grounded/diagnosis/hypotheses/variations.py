@@ -1,8 +1,7 @@
 """Variations of a set of effects that say the same in other terms, for the rule to choose from.
 
 A set that grew one effect at a time may blame more than it needs, or name an effect that another
-one contains. So it is varied, and every variation is fitted until it converges, with constants of
-its own:
+one contains. So it is varied, and every variation is fitted until it converges:
 
     one for several effects of single inputs become one of several inputs (`delay:a+b`)
     fewer inputs    an effect of several inputs becomes one of some of them, or one of each
@@ -16,7 +15,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.diagnosis.hypotheses.search import LARGE_GAIN, TO_THE_TOP, HypothesisSearch
+from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
@@ -26,7 +25,6 @@ from grounded.effects.drive import motion_of, push
 from grounded.effects.joint import joint_friction, load_friction
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
-TUNED = 2  # best larger sets whose constants are optimised
 LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
 
 Change = Mapping[
@@ -43,7 +41,6 @@ def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
             known.add(names)
             starts.append((h, fit.noise, fit.track))
     found = search.refined(starts, TO_THE_TOP)
-    tune(search, found)  # the speed over which another law builds up is not that of this one
     size = len(fit.hypothesis.effects)
     small = [f for f in map(search.latest, found) if len(f.hypothesis.effects) <= size]
     best = max([fit, *small], key=search.score)
@@ -148,53 +145,3 @@ def in_place(h: Hypothesis, change: Change) -> Hypothesis:
         for other, own in change.get(effect.name, ((effect, values),)):
             found = found.plus(other, own)
     return found
-
-
-FIRST, COARSE, LAST = 3.0, 1.4, 1.05  # factors by which a constant is changed
-STEPS = 12  # most changes of a constant
-
-
-def tune(search: HypothesisSearch, fits: list[Fitted]) -> None:
-    """Optimise constants of large effects (such as the speed over which dry friction builds up).
-
-    A constant is not fitted with the other values: for a small effect, any sensible one will do. If
-    an effect gains many nats, a wrong constant leaves so much that further effects are blamed for
-    it. So it is varied by shrinking factors, with the rest fitted again each time, and counts as
-    one more parameter.
-    """
-    floor = search.score(search.best_null()) + LARGE_GAIN
-    for fit in fits:
-        if search.score(fit) < floor:
-            continue
-        for index, effect in enumerate(fit.hypothesis.effects):
-            for q in effect.quantities:
-                if q.tunable:
-                    fit = _walked(search, fit, index, q.name)
-
-
-def _walked(search: HypothesisSearch, fit: Fitted, index: int, name: str) -> Fitted:
-    """Maximise over one constant: uphill by factors, then to the top of a parabola."""
-    factor = FIRST
-    for _ in range(STEPS):
-        at = fit.hypothesis.values[index][name]
-        tried = _tried(search, fit, index, name, (at / factor, at * factor))
-        best = max([fit, *tried], key=search.score)
-        if best is fit and factor < COARSE and len(tried) == 2:
-            down, up = (search.score(f) - search.score(fit) for f in tried)
-            part = 0.5 * (down - up) / min(down + up, -1e-9)
-            tried = _tried(search, fit, index, name, (at * factor ** float(part),))
-            best = max([fit, *tried], key=search.score)
-        factor = factor**0.5 if best is fit or factor < COARSE else factor
-        fit = best
-        if factor < LAST:
-            break
-    return fit
-
-
-def _tried(
-    search: HypothesisSearch, fit: Fitted, index: int, name: str, values: tuple[float, ...]
-) -> list[Fitted]:
-    (q,) = (q for q in fit.hypothesis.effects[index].quantities if q.name == name)
-    inside = dict.fromkeys(float(np.clip(v, q.low, q.high)) for v in values)
-    starts = [(fit.hypothesis.tuned(index, name, v), fit.noise, fit.track) for v in inside]
-    return search.refined(starts, TO_THE_TOP)

@@ -102,17 +102,8 @@ class Hypothesis:
     def plus(self, effect: Effect, values: Mapping[str, float]) -> Hypothesis:
         """Add an effect; constants among its values replace the effect's own."""
         whole = {**effect.fixed, **values}
-        for name, value in effect.fixed.items():
-            if whole[name] != value:
-                effect = effect.tuned(name, whole[name])
+        effect = effect.with_constants(whole)
         return replace(self, effects=(*self.effects, effect), values=(*self.values, whole))
-
-    def tuned(self, index: int, name: str, value: float) -> Hypothesis:
-        """Change one constant of one effect."""
-        effects, values = list(self.effects), list(self.values)
-        effects[index] = effects[index].tuned(name, value)
-        values[index] = {**values[index], name: value}
-        return replace(self, effects=tuple(effects), values=tuple(values))
 
     def minus(self, name: str) -> Hypothesis:
         """Remove an effect."""

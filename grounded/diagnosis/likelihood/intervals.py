@@ -69,7 +69,6 @@ def standard_deviations(
     """
     if fit.gram.shape[-1] == 0:
         return np.zeros(0), np.zeros(0)
-    fit, kept = with_tuned(predictor, fit)
     std = fisher(worth * fit.gram.sum(axis=0) + np.diag(fit.prior))
     half = NORMAL * std
     shifts = leave_one_out(fit, trial_of, unseen=0.0)
@@ -85,30 +84,7 @@ def standard_deviations(
         between_steps(fit.hypothesis, predictor.data.dt, len(std)),
         between_samples(fit.hypothesis, predictor.data, len(std)),
     )
-    return np.hypot(std, smeared)[kept], np.hypot(half, NORMAL * smeared)[kept]
-
-
-def with_tuned(predictor: Predictor, fit: Fitted) -> tuple[Fitted, Any]:
-    """Return a fit whose tuned constants are unknowns, too, and where its own unknowns are there.
-
-    The data tell such a constant no better than other values (the speed over which a dry friction
-    builds up), and what it may be off moves these.
-    """
-    h, own = fit.hypothesis, len(fit.hypothesis.theta)
-    free = [
-        replace(
-            e, quantities=tuple(replace(q, fixed=q.fixed and not q.tuned) for q in e.quantities)
-        )
-        for e in h.effects
-    ]
-    tuned = [q.tuned for e in free for q in e.free]
-    extra = fit.gram.shape[-1] - own
-    kept = np.flatnonzero([*(not one for one in tuned), *[True] * extra])
-    if not any(tuned):
-        return fit, kept
-    start = (replace(h, effects=tuple(free)), fit.noise, fit.track)
-    found = refine(predictor, [start], iterations=1, fixed_noise=True)
-    return (found[0], kept) if found else (fit, np.arange(fit.gram.shape[-1]))
+    return np.hypot(std, smeared), np.hypot(half, NORMAL * smeared)
 
 
 def level(predictor: Predictor, fit: Fitted, j: int, drop: float) -> tuple[float, float]:

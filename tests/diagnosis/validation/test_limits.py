@@ -11,7 +11,6 @@ from grounded.diagnosis.diagnose import DiagnosisOptions
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.likelihood.data import prepare
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
-from grounded.diagnosis.likelihood.intervals import standard_deviations
 from grounded.diagnosis.validation.claims import moved_parameters
 from grounded.diagnosis.validation.identifiable import identified
 from grounded.diagnosis.validation.limits import excitation, knowable, without_others
@@ -460,30 +459,3 @@ def test_a_delay_is_no_surer_than_states_between_two_samples():
     d, least = row.params["d"], log.interpolated_s
     assert row.effect == "sensor_delay:w" and abs(d.value - 0.05) < 2 * d.std
     assert least <= d.std < least + 1e-3
-
-
-def test_values_are_no_surer_than_the_constant_that_was_tuned_beside_them():
-    model = Model(
-        states={"q": "rad", "w": "rad/s"},
-        inputs={"tau": "N m"},
-        derivative=lambda s, a, p: {"q": s.w, "w": a.tau / 0.02},
-    )
-
-    def rates(x, u):
-        return np.array([x[1], (u[0] - 0.08 * np.clip(x[1] / 0.3, -1, 1)) / 0.02])
-
-    rng, trials, dt = np.random.default_rng(3), [], 0.01
-    u = sum(a * np.sin(f * dt * np.arange(300)) for a, f in ((0.2, 9.0), (0.15, 23.0)))
-    for _ in range(3):
-        x = stepped(rates, u, dt, np.zeros(2), fine=4, disturbed=np.array([0, 1e-3]), rng=rng)
-        trials.append(logged(model, x, u, dt, [1e-4, 3e-3], rng))
-    data = prepare(model, trials)
-    effect = Library().effect("joint_friction:tau<-w", model, data.scales)
-    untuned = tuple(replace(q, tuned=False) for q in effect.quantities)
-    search, std = HypothesisSearch(data, (effect,)), []
-    h = Hypothesis().plus(effect, {"c": 0.08, "b": 0.0, "width": 0.3})
-    for one in (replace(h, effects=(replace(effect, quantities=untuned),)), h):
-        (fit,) = search.refined([search.fresh(one)], 20)
-        std.append(standard_deviations(search.predictor, fit, data.trial_of)[0])
-    assert len(std[0]) == len(std[1]) == len(h.theta)
-    assert std[1][0] > 1.2 * std[0][0]

@@ -20,6 +20,7 @@ from grounded.effects import joining_order, param_name
 from grounded.effects.family import (
     Effect,
     Family,
+    RateFamily,
     Scales,
     SensorDelayFamily,
     SensorLagFamily,
@@ -31,6 +32,7 @@ from grounded.search.planner import Planner, planner_with
 from grounded.task import Task
 from grounded_trials.plain_file import unreadable
 
+LINEAR = ("c", "k", "A", "B", "a", "b")  # parameters that an added rate is proportional to
 STEEP = 3.0  # largest change of speed by dry friction in one step, in units of its width
 
 
@@ -72,11 +74,28 @@ def settled(
 def in_order(
     old: Sequence[Mapping[str, Any]], new: Sequence[Mapping[str, Any]]
 ) -> list[dict[str, Any]]:
-    """Merge a model's effects with newly diagnosed ones, in the order in which they act."""
+    """Merge a model's effects with newly diagnosed ones, in the order in which they act.
+
+    A rate gain was diagnosed on the rate including the adopted effects, but acts on the model's own
+    rate. So the adopted effects on that rate are scaled by the gain.
+    """
     library = installed_effects()
-    both = (old, new)
+    both = ([_grown(library, effect, new) for effect in old], new)
     families = [[library.family(str(e["name"]).partition(":")[0]) for e in some] for some in both]
     return [dict(both[late][i]) for late, i in joining_order(*families)]
+
+
+def _grown(
+    library: Library, effect: Mapping[str, Any], new: Sequence[Mapping[str, Any]]
+) -> Mapping[str, Any]:
+    """Scale an adopted effect on a rate by the newly diagnosed gain of that rate, if any."""
+    name, _, target = str(effect["name"]).partition(":")
+    family, driven = library.family(name), target.partition("<-")[0]
+    gains = [1 + e["g"] for e in new if e["name"] == f"rate_gain:{driven}"]
+    if not gains or not isinstance(family, RateFamily) or family.needs_own:
+        return effect
+    grown = {k: float(f"{v * gains[0]:.8g}") for k, v in effect.items() if k in LINEAR}
+    return {**effect, **grown}
 
 
 def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
