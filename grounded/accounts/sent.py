@@ -26,9 +26,9 @@ from grounded.trial import Trial
 WINDOWS = 8  # parts of a trial that must each be alike (within 2x): somebody may take over
 ROUGH = 4.0  # steps over which noise may be correlated; longer deviations count more
 BACK = (0.0, 0.5, 1.0, 1.5, 2.0, -0.5, -1.0)  # ages of the states acted on that are tried, in steps
-# differences from the prediction, of a state's usual size: at most in any state of a run as planned
-# (a sign or a unit puts a column farther off); usual in a run like it (1.4 if unrelated)
-CLOSE, ALIKE = 0.6, 1.0
+# difference from the prediction, of a state's usual size: at most in any state of a run as planned
+# (a sign or a unit puts a column farther off)
+CLOSE = 0.6
 AGES = 1.0  # steps by which that age varies in a run (lost packets, clock drift and jitter)
 
 
@@ -265,13 +265,6 @@ def far(own: Ran, trial: Trial, first: int = 0) -> Array:
 def apart(own: Ran, trial: Trial, first: int = 0) -> float:
     """Return how far a trial, from step `first` on, is from its prediction [nats] in all states."""
     return float(np.nansum(np.log(np.fmax(far(own, trial, first), FINE))))
-
-
-def like_predicted(own: Ran, trial: Trial) -> bool:
-    """Return whether most states of a trial are near their prediction, as far as one is known."""
-    known = far(own, trial)
-    known = known[np.isfinite(known)]
-    return not len(known) or bool(np.median(known) < ALIKE)
 
 
 def as_planned(own: Ran, trial: Trial) -> bool:

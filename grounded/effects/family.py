@@ -374,6 +374,8 @@ class Effect:
 
     def with_constants(self, values: Mapping[str, float]) -> Effect:
         """Return the same effect with other values of constants."""
+        if all(values[name] == value for name, value in self.fixed.items()):
+            return self
         new = (replace(q, start=values[q.name]) if q.fixed else q for q in self.quantities)
         return replace(self, quantities=tuple(new))
 

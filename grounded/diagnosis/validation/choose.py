@@ -152,13 +152,15 @@ class Rule:
 
     def better(self, before: Option, after: Option) -> bool:
         """Check whether one set predicts better than another, and evidence does not contradict."""
-        if after.size > before.size and not self.nats(before, after) >= PICKED:  # also of none
+        larger = after.size > before.size
+        if larger and not self.nats(before, after) >= PICKED:  # also of none
             return False
         if not self.held_out:
             return True
         gain = self.gain(before.errors, after.errors)
-        beyond_doubt = gain.clear and gain.mean > SHOWS
-        return beyond_doubt or (gain.pays and self.nats(before, after) > -PICKED)
+        if larger or not gain.pays or (gain.clear and gain.mean > SHOWS):
+            return gain.pays
+        return self.nats(before, after) > -PICKED
 
     def _needed(self, option: Option, cause: str) -> bool:
         less = self.less(option, cause)

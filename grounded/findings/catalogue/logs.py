@@ -14,7 +14,6 @@ CALL = (
     "call `runner.action` in each control step with the seconds since the run began and the "
     "states as they are logged, send what it returns at once, and run {ran} again"
 )
-ANEW = "`discard {trial}` and run {ran} again; if it ran as it should, `propose` goes on"
 SPAN = "if it began elsewhere, `discard` it and set [log.span] start"
 
 
