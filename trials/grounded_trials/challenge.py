@@ -57,10 +57,6 @@ def write_cases(
         folder: receives the workspaces and the manifest.
         labels: receives the labels; must lie outside `folder`.
         tick: called with the number of cases written so far.
-
-    Raises:
-        GroundedError: if the folder already holds a challenge or other cases, or if `labels` lies
-            inside it.
     """
     if (folder / MANIFEST).exists():
         raise refused("file.exists", folder / MANIFEST)
@@ -105,11 +101,7 @@ def _write_case(case: Case, folder: Path) -> list[str]:
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the cases of a challenge from its manifest.
-
-    Raises:
-        GroundedError: if there is no manifest, or it can't be read.
-    """
+    """Read the cases of a challenge from its manifest."""
     path = folder / MANIFEST
     try:
         return dict(json.loads(read_file(path, LIMIT))["cases"])
@@ -118,11 +110,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]:
-    """Read a case's label and check its hash against the manifest's entry.
-
-    Raises:
-        GroundedError: if it is missing or was changed.
-    """
+    """Read a case's label and check its hash against the manifest's entry."""
     path = labels / f"{name}.json"
     data = read_file(path, LIMIT)
     if hashlib.sha256(data).hexdigest() != entry["label_sha256"]:
@@ -133,11 +121,7 @@ def open_label(labels: Path, name: str, entry: dict[str, Any]) -> dict[str, Any]
 def score_case(
     folder: str | Path, labels: str | Path, name: str, entry: dict[str, Any]
 ) -> dict[str, Any]:
-    """Score one case from its reports/diagnosis.json (a job).
-
-    Raises:
-        GroundedError: if it was not diagnosed, or a trial or label was changed.
-    """
+    """Score one case from its reports/diagnosis.json (a job)."""
     workspace = Folder(Path(folder) / name)
     hashes = [hashlib.sha256(workspace.store.read(s)).hexdigest() for s in workspace.store.list()]
     if hashes != entry["trials_sha256"]:
@@ -171,9 +155,6 @@ def diagnose_cases(
         again: also repeat the diagnoses that exist.
         engine: where the jobs run.
         progress: called with the number of jobs done and the total.
-
-    Raises:
-        GroundedError: if the folder holds no challenge, or a worker dies.
     """
     every = read_manifest(folder)
     names = [n for n in every if again or not (folder / n / "reports" / DIAGNOSIS).is_file()]
@@ -203,11 +184,7 @@ def score_cases(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> list[dict[str, Any]]:
-    """Score every case against an oracle that knows its label.
-
-    Raises:
-        GroundedError: if a case was not diagnosed, or a trial or label was changed.
-    """
+    """Score every case against an oracle that knows its label."""
     entries = read_manifest(folder)
     where = {"folder": str(folder.resolve()), "labels": str(labels.resolve())}
     cases = [where | {"name": name, "entry": entry} for name, entry in entries.items()]

@@ -26,10 +26,6 @@ def open_file(path: Path, *, follow: bool = True) -> BufferedReader:
     Args:
         path: the file.
         follow: whether symbolic links are followed; False refuses them.
-
-    Raises:
-        GroundedError: if it is a pipe, a device, a socket, or a link that must not be followed.
-        OSError: as `open`.
     """
     if not follow and path.is_symlink():
         raise unreadable(path, "link")
@@ -48,11 +44,7 @@ def open_file(path: Path, *, follow: bool = True) -> BufferedReader:
 
 
 def read_file(path: Path, limit: int | None = None, *, follow: bool = True) -> bytes:
-    """Return the bytes of a regular file; for `follow` see `open_file`.
-
-    Raises:
-        GroundedError: if it is missing, unreadable, or larger than `limit` bytes.
-    """
+    """Return the bytes of a regular file; for `follow` see `open_file`."""
     try:
         with open_file(path, follow=follow) as stream:
             data = stream.read(-1 if limit is None else limit + 1)
@@ -66,11 +58,7 @@ def read_file(path: Path, limit: int | None = None, *, follow: bool = True) -> b
 
 
 def path_of(given: object) -> Path:
-    """Return the path of a file that the user named.
-
-    Raises:
-        GroundedError: if it is not a text or a path.
-    """
+    """Return the path of a file that the user named."""
     named: Any = given
     return Path(of_type("the path of a file", named, str, Path))
 

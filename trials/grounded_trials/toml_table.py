@@ -139,12 +139,7 @@ def _types(kind: Any) -> dict[str, tuple[Any, Any]]:
 
 
 def read_toml(path: Path) -> Table:
-    """Read a TOML file as a table.
-
-    Raises:
-        GroundedError: if it does not exist, can't be read, or is not valid TOML (with line and
-            column).
-    """
+    """Read a TOML file as a table."""
     if not path.exists():
         near = sorted(str(one.parent) for one in path.parent.glob(f"*/{path.name}"))
         then = None if near else NextCommand("init", ("DIR", "--example", "car-turn"))

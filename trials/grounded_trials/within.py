@@ -92,11 +92,6 @@ def within(
             here. Files that it writes to the temporary folder are deleted.
         *args: its arguments.
         **kwargs: its named arguments.
-
-    Raises:
-        OverBudget: if it exceeds a limit, or the child crashes.
-        GroundedError: for a setting in the environment that is not a positive number, and whatever
-            `function` raises.
     """
     if _inside or not FORKS:
         return function(*args, **kwargs)

@@ -33,12 +33,7 @@ _SEALED = re.compile(rb'\{\n "sha256": "([0-9a-f]{64})",(\n.*)', re.DOTALL)
 
 
 def write_document(path: Path, document: Mapping[str, Any]) -> None:
-    """Write a JSON document with its checksum, atomically.
-
-    Raises:
-        GroundedError: if it can't be written.
-        ValueError: if a number is not finite.
-    """
+    """Write a JSON document with its checksum, atomically."""
     text = json.dumps(dict(document), indent=1, ensure_ascii=False, allow_nan=False)
     rest = text[1:].encode() + b"\n"
     digest = hashlib.sha256(rest).hexdigest()
@@ -46,12 +41,7 @@ def write_document(path: Path, document: Mapping[str, Any]) -> None:
 
 
 def read_document(path: Path) -> dict[str, Any]:
-    """Read a document from a file, without its checksum.
-
-    Raises:
-        FileNotFoundError: if the file does not exist.
-        GroundedError: if it can't be read, or its checksum does not match.
-    """
+    """Read a document without its checksum; a missing file is a FileNotFoundError."""
     try:
         with open_file(path, follow=False) as stream:
             data = stream.read()
@@ -75,9 +65,6 @@ def read_as(path: Path, kind: type[D], **facts: Any) -> D | None:
         path: the file.
         kind: the type that wrote it, maybe of another version.
         **facts: what the error says besides, see `unreadable`.
-
-    Raises:
-        GroundedError: if it can't be read, or holds something else.
     """
     try:
         return kind.from_json(read_document(path))
@@ -99,9 +86,6 @@ class Notes:
         Args:
             note: its contents.
             again: add it even if an equal note exists.
-
-        Raises:
-            GroundedError: if it can't be written.
         """
         with self.adding(note, again=again):
             pass
@@ -118,9 +102,6 @@ class Notes:
 
         Args:
             lost: damaged notes are appended to it; None: they raise an error.
-
-        Raises:
-            GroundedError: naming a damaged note, if `lost` is None.
         """
         for entry in self.store.list():
             try:

@@ -198,9 +198,6 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         source: its path, or its bytes.
         name: name of the file in messages, if `source` is bytes.
         kind: the required format, `TRIAL` or `CANDIDATE`.
-
-    Raises:
-        GroundedError: if it can't be read, is damaged, or has another format.
     """
     if not isinstance(source, bytes):
         name, source = str(source), read_file(Path(source), FILE_LIMIT)
@@ -245,9 +242,6 @@ def stated(
         inputs: name -> unit, in array order.
         meta: the caller's own entries.
         **more: the entries that only this format has.
-
-    Raises:
-        GroundedError: if an entry of `meta` is reserved.
     """
     for key in meta:
         if key in RESERVED:

@@ -78,11 +78,7 @@ class Store:
         self._listed: tuple[list[str], tuple[Stored, ...]] = ([], ())  # the last listing
 
     def list(self) -> tuple[Stored, ...]:
-        """Return the files in order of arrival; reads only the folder, no file.
-
-        Raises:
-            GroundedError: if the folder can't be read.
-        """
+        """Return the files in order of arrival; reads only the folder, no file."""
         try:
             names = os.listdir(self.folder)  # noqa: PTH208 (many times faster)
         except FileNotFoundError:
@@ -103,11 +99,7 @@ class Store:
         return any(entry.digest == sha256[:DIGITS] for entry in self.list())
 
     def find(self, key: str) -> Stored:
-        """Return the file whose short name or name is `key`.
-
-        Raises:
-            GroundedError: if there is none, or more than one.
-        """
+        """Return the file whose short name or name is `key`."""
         hits = self.matching(key)
         if len(hits) == 1:
             return hits[0]
@@ -121,11 +113,7 @@ class Store:
         return tuple(s for s in self.list() if key in (s.id, s.path.name))
 
     def read(self, key: str | Stored) -> bytes:
-        """Return the contents of a file, checked against its hash.
-
-        Raises:
-            GroundedError: if it does not exist, can't be read, or was changed.
-        """
+        """Return the contents of a file, checked against its hash."""
         entry = key if isinstance(key, Stored) else self.find(key)
         data = read_file(entry.path, follow=False)
         if hashlib.sha256(data).hexdigest()[:DIGITS] != entry.digest:
@@ -142,9 +130,6 @@ class Store:
             data: its contents.
             suffix: suffix of its name in the store.
             again: store equal contents as a new file, for a run that repeats another bit by bit.
-
-        Raises:
-            GroundedError: if the folder can't be written.
         """
         digest = hashlib.sha256(data).hexdigest()
         with self.locked():
@@ -185,11 +170,7 @@ class Store:
             raise
 
     def verify(self) -> tuple[Lost, ...]:
-        """Read every file, and return the damaged ones.
-
-        Raises:
-            GroundedError: if the folder can't be read.
-        """
+        """Read every file, and return the damaged ones."""
         damaged = []
         for entry in self.list():
             try:
@@ -200,11 +181,7 @@ class Store:
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Lock the store, so that no other process adds a file meanwhile.
-
-        Raises:
-            GroundedError: if the folder can't be written.
-        """
+        """Lock the store, so that no other process adds a file meanwhile."""
         try:
             from filelock import FileLock, has_fcntl
 
@@ -230,11 +207,7 @@ class Store:
 
 
 def made_folder(folder: Path) -> Path:
-    """Create a folder, with those above it, if it does not exist yet; return it.
-
-    Raises:
-        GroundedError: if it can't be created.
-    """
+    """Create a folder, with those above it, if it does not exist yet; return it."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -243,11 +216,7 @@ def made_folder(folder: Path) -> Path:
 
 
 def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file atomically: temporary name, sync, rename, sync of the folder.
-
-    Raises:
-        GroundedError: if it can't be written.
-    """
+    """Write a file atomically: temporary name, sync, rename, sync of the folder."""
     if path.is_dir():
         raise unwritable(path, "folder")
     try:
@@ -301,11 +270,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def hash_file(path: Path) -> str:
-    """Return the SHA-256 of a file, read in blocks.
-
-    Raises:
-        GroundedError: if it can't be read.
-    """
+    """Return the SHA-256 of a file, read in blocks."""
     try:
         with open_file(path) as stream:
             return hashlib.file_digest(stream, "sha256").hexdigest()

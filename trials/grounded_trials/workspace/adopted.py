@@ -41,9 +41,6 @@ def installed_effects() -> Library:
 
     A package adds families by the entry point group `grounded.effects`: a family, or a sequence of
     families.
-
-    Raises:
-        GroundedError: for an entry point that can't be loaded or holds something else.
     """
     found: list[Family] = []
     for point in metadata.entry_points(group="grounded.effects"):
@@ -99,11 +96,7 @@ def _grown(
 
 
 def planner_of(task: Task, effects: Sequence[Mapping[str, Any]]) -> Planner:
-    """Return the planner of a task with these effects in its model, in the order in which they act.
-
-    Raises:
-        GroundedError: for an unknown effect, or a quantity that is missing or unknown.
-    """
+    """Return the planner of a task with these effects in its model, in the order they act."""
     library = installed_effects() if effects else None
     given = [(str(e["name"]), {k: v for k, v in e.items() if k != "name"}) for e in effects]
     return planner_with(task, given, library, partial(_followed, dt=task.dt))

@@ -129,11 +129,7 @@ def joined(
     nominal: Mapping[str, float],
     calibrated: Mapping[str, Estimate],
 ) -> tuple[dict[str, float], list[dict[str, Any]]]:
-    """Return the parameters to set and all effects, after adding diagnosed effects to a model.
-
-    Raises:
-        GroundedError: if a value is not known.
-    """
+    """Return the parameters to set and all effects, after adding diagnosed effects to a model."""
     before, fitted = diagnosis.made.effects, [*diagnosis.joining]
     old, new = {str(effect["name"]): dict(effect) for effect in effects}, list[dict[str, Any]]()
     params = {name: _rounded(estimate.value) for name, estimate in calibrated.items()}
@@ -240,11 +236,7 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
 
 
 def _with_curves(diagnosis: Diagnosis, names: list[str]) -> list[str]:
-    """Replace `correction:v`, or some of its curves, by all of them.
-
-    Raises:
-        GroundedError: if the correction is not adoptable, or claimed effects are not adopted too.
-    """
+    """Replace `correction:v`, or some of its curves, by all of them."""
     one, curves = diagnosis.correction, _curves(diagnosis)
     asked = [n for n in names if n.startswith("correction:")]
     if one is None or not asked or not {*asked} <= {f"correction:{one.channel}", *curves}:
@@ -263,12 +255,7 @@ def _curves(diagnosis: Diagnosis) -> list[str]:
 
 
 def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -> bool:
-    """Return whether the verdict claims all the effects, but for late sensors.
-
-    Raises:
-        GroundedError: if one is not in the diagnosis, or was adopted since; if several are named
-            and some were fitted as alternatives to others.
-    """
+    """Return whether the verdict claims all the effects, but for late sensors."""
     physics = [name for name in names if name not in diagnosis.late_sensors]
     if diagnosis.changed and physics:
         raise refused("gap.next.changed", then=newer_alone(diagnosis))
@@ -337,22 +324,14 @@ class Kept(Document):
 
 
 def kept(workspace: Folder) -> Kept:
-    """Read what is kept of a workspace's model.
-
-    Raises:
-        GroundedError: if reports/adoptions.json can't be read.
-    """
+    """Read what is kept of a workspace's model."""
     return read_as(workspace.reports / KEPT, Kept, mend="delete") or Kept()
 
 
 def keep(
     workspace: Folder, values: Mapping[str, tuple[float, ...]] = MappingProxyType({}), **more: Any
 ) -> None:
-    """Keep values of the model with their standard deviations, and change other fields of `Kept`.
-
-    Raises:
-        GroundedError: as `kept`, or if it can't be written.
-    """
+    """Keep values of the model with their +-, and change other fields of `Kept`."""
     made_folder(workspace.reports)
     before = kept(workspace)
     after = replace(before, values={**before.values, **values}, **more)
@@ -422,11 +401,7 @@ class Better:
 
 
 def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | None:
-    """Return the diagnosed model, else the one with adopted effects, or None if there is neither.
-
-    Raises:
-        GroundedError: if the diagnosis names an unknown effect or parameter.
-    """
+    """Return the diagnosed model, else the one with adopted effects; None if there is neither."""
     table, task = workspace.config.model, workspace.task
     if diagnosis is not None:
         new = diagnosis.open(table.effects, table.params)

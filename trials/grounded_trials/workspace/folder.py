@@ -77,12 +77,7 @@ class Folder:
 
     @cached_property
     def config(self) -> Config:
-        """The checked grounded.toml.
-
-        Raises:
-            GroundedError: also if a folder of the workspace is a link out of it, into which its
-                commands would write.
-        """
+        """The checked grounded.toml."""
         for name in ("trials", "candidates", "runs", "reports"):
             place = self.folder / name
             if place.is_symlink() and not place.resolve().is_relative_to(self.folder.resolve()):
@@ -203,9 +198,6 @@ class Folder:
 
         Args:
             strict: raise for damaged files; else they are left out and named in `lost`.
-
-        Raises:
-            GroundedError: if the task can't be built; if strict, also for damaged files.
         """
         names = self.names()
         if names not in self._contents:
@@ -219,11 +211,7 @@ class Folder:
         return found
 
     def trials(self) -> tuple[StoredTrial, ...]:
-        """Return every stored trial that is not set aside, in order of arrival.
-
-        Raises:
-            GroundedError: if one, or a note, is damaged, naming it.
-        """
+        """Return every stored trial that is not set aside, in order of arrival."""
         trials, _, errors = self._trials
         for error in errors:
             raise error
@@ -281,19 +269,11 @@ class Folder:
         return f"c{(int(ids[-1][1:]) if ids else 0) + 1:04d}"
 
     def candidate(self, identity: str) -> tuple[Candidate, dict[str, str]]:
-        """Read a candidate and its metadata, from its file or from a trial that ran it.
-
-        Raises:
-            GroundedError: if neither exists, or the file is damaged.
-        """
+        """Read a candidate and its metadata, from its file or from a trial that ran it."""
         return candidate_of(self.candidate_bytes(identity), identity)
 
     def candidate_bytes(self, identity: str) -> bytes:
-        """Return the contents of a candidate's file, or the copy in a trial that ran it.
-
-        Raises:
-            GroundedError: if there is no candidate of that name.
-        """
+        """Return the contents of a candidate's file, or the copy in a trial that ran it."""
         for read in self._sources(identity):
             return read()
         raise unknown_candidate(self, identity)

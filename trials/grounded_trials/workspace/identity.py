@@ -159,11 +159,7 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
 
 
 def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
-    """Decode a candidate and its metadata from the bytes of its file.
-
-    Raises:
-        GroundedError: if the file is damaged, rewritten, or another candidate's.
-    """
+    """Decode a candidate and its metadata from the bytes of its file."""
     key = sha256(data), identity
     if key not in _DECODED:
         _DECODED[key] = _decoded(data, identity)
@@ -233,11 +229,7 @@ def _unknown(name: str, kind: str, known: Sequence[str]) -> GroundedError:
 
 
 def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str]) -> tuple[str, ...]:
-    """Return the trials that fit and diagnose are to use, in lower case; empty: all usable ones.
-
-    Raises:
-        GroundedError: if nothing can be used, or a name is no usable trial.
-    """
+    """Return the trials that fit and diagnose are to use, in lower case; empty: all usable ones."""
     if isinstance(names, str):
         raise wrong("trials", names, must="names", like=f"['{names}']")
     given = list_of(names, str, "trials")

@@ -41,11 +41,7 @@ def write_diagnosis(folder: Path, found: Diagnosis) -> None:
 
 
 def read_diagnosis(folder: Path) -> Diagnosis | None:
-    """Read the diagnosis in a reports folder; return None if there is none.
-
-    Raises:
-        GroundedError: if the file can't be read, or does not hold a diagnosis.
-    """
+    """Read the diagnosis in a reports folder; return None if there is none."""
     if not (folder / FILE).exists():
         return None
     from grounded.diagnosis.parts import Diagnosis  # slow, and seldom needed
@@ -69,9 +65,6 @@ def diagnosable(workspace: Folder) -> list[Trial]:
     """Return the trials in order of arrival, each up to the first missing or unbounded number.
 
     A sensor dropout only costs its own samples, not the rest of the trial.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
     """
     cut = [trial.until(trial.known_steps) for trial in workspace.task_trials(measured=True)]
     return [trial for trial in cut if trial.steps >= LEAST_STEPS]
@@ -91,9 +84,6 @@ def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
     Args:
         workspace: the workspace.
         names: short names of the trials; empty: all usable ones.
-
-    Raises:
-        GroundedError: if there is none, or one of those named can't be used.
     """
     used = diagnosable(workspace)
     names = named_trials(workspace, names, [trial.id for trial in used])
@@ -108,11 +98,7 @@ def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
 
 
 def left_out(workspace: Folder) -> list[Finding]:
-    """Return which trials nothing can use, since [task] dt or the model was changed.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
-    """
+    """Return which trials nothing can use, since [task] dt or the model was changed."""
     others = [one.stored.id for one in workspace.trials() if not workspace.fits(one.trial)]
     return [found("search.left_out", *others)] if others else []
 

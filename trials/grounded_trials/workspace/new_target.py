@@ -61,10 +61,6 @@ def replace_target(
     """Write target.csv, and its length and weights to grounded.toml, see `Workspace.target`.
 
     Both files are kept as they were, with `.bak` behind their names.
-
-    Raises:
-        GroundedError: if the columns are no target of the model, see `checked`; if grounded.toml
-            has other errors; or if a file can't be written. The files are then as before.
     """
     columns = checked(columns, model)
     rows = len(next(iter(columns.values())))
@@ -107,12 +103,7 @@ def replace_target(
 
 
 def checked(columns: Any, model: Model) -> dict[str, Array]:
-    """Return the columns of a target as arrays of equal length, (H + 1,).
-
-    Raises:
-        GroundedError: for a name that is not a state of the model, a column that is not a row of
-            finite numbers, columns of different lengths, or too few or too many rows.
-    """
+    """Return the columns of a target as arrays of equal length, (H + 1,)."""
     if not isinstance(columns, Mapping) or not columns:
         like = f"{{'{model.state_names[0]}': numpy.linspace(0, 1, 101)}}"
         raise wrong("the columns of a target", columns, must="dict", like=like)

@@ -224,11 +224,7 @@ def export_candidate(
 
 
 def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:
-    """Return the format that a file's ending names; `default` without an ending.
-
-    Raises:
-        GroundedError: for any other ending.
-    """
+    """Return the format that a file's ending names; `default` without an ending."""
     ending = path.suffix.lstrip(".").lower() if path else ""
     if ending in formats:
         return ending

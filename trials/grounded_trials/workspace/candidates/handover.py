@@ -92,11 +92,6 @@ def checked_candidate(
         anyway: hand it over despite reasons against it, which are then in `overridden`.
         other_task: accept a candidate of another task if a trial ran it.
         now: the standing of the search, if known.
-
-    Raises:
-        Void: if it must not be handed over, unless `anyway`.
-        GroundedError: if its file is damaged, rewritten, renamed, or for another robot; also if
-            [log] lacks an input or counts a delay twice, unless `anyway`.
     """
     data = workspace.candidate_bytes(identity)
     candidate, meta = candidate_of(data, identity)
@@ -132,12 +127,7 @@ def unmapped(workspace: Folder) -> Finding | None:
 
 
 def check_log(workspace: Folder) -> None:
-    """Refuse to plan for inputs that [log] lacks (see `unmapped`), or for delays that count twice.
-
-    Raises:
-        GroundedError: if there is such an input, or if [log] removes a delay that an adopted effect
-            has in the model as well.
-    """
+    """Refuse to plan for inputs that [log] lacks, or for delays that count twice."""
     for one in (twice_in_time(workspace), unmapped(workspace)):
         if one is not None:
             raise GroundedError(one)
@@ -164,11 +154,7 @@ class Check:
         return self.meta.get("task") == self.workspace.task.hash
 
     def refuse_foreign(self, found_hash: str) -> None:
-        """Refuse a candidate for another robot, or one not equal to what was handed out or run.
-
-        Raises:
-            GroundedError: if it is such a candidate.
-        """
+        """Refuse a candidate for another robot, or one not equal to what was handed out or run."""
         made, model = self.candidate, self.workspace.base_model
         for names, own in (
             (made.policy.state_names, model.state_names),

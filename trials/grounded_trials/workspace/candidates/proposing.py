@@ -249,11 +249,7 @@ def _disowned(now: Standing, aside: Collection[str]) -> list[Finding]:
 
 
 def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = ()) -> Status:
-    """Return a standing with the command to type next and the state of the last diagnosis.
-
-    Raises:
-        GroundedError: if a stored file is damaged.
-    """
+    """Return a standing with the command to type next and the state of the last diagnosis."""
     standing = undecided(workspace, standing)
     here = Situation(workspace, standing)
     last, then = here.diagnosis, here.then

@@ -82,11 +82,7 @@ def run_candidate(
 
 
 def simulated_plant(workspace: Folder) -> Plant:
-    """Return the simulated system of [system] model.
-
-    Raises:
-        GroundedError: if its file defines no model, or [system.noise] names an unknown state.
-    """
+    """Return the simulated system of [system] model."""
     system = workspace.config.system
     module = load_module(workspace.folder, file=system.model, key="[system] model")
     model = model_in(module)

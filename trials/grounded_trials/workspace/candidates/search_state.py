@@ -47,9 +47,6 @@ def standing_in(
         ahead: also plan the next candidate, without writing it, which shows whether the search has
             anything left to gain.
         contents: the contents of the folder, if they were read already.
-
-    Raises:
-        GroundedError: if a stored file is damaged, or the task can't be planned.
     """
     contents = contents or workspace.read()
     now = standing_of(workspace, contents)
@@ -179,11 +176,7 @@ def _version() -> tuple[str, int]:
 
 
 def candidate_named(workspace: Folder, name: str | None, now: Standing | None = None) -> str:
-    """Return the id of the named candidate, of the best for `best`, of the outstanding for None.
-
-    Raises:
-        GroundedError: if there is none of that name, no best one yet, or none is outstanding.
-    """
+    """Return the id of the named candidate, of the best for `best`, of the outstanding for None."""
     if name is None:
         waiting = standing_in(workspace).outstanding
         if waiting is None:

@@ -231,11 +231,7 @@ def _gain(model: Model, name: str, drives: str) -> float:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Return the table that a YAML file holds.
-
-    Raises:
-        GroundedError: if it can't be read, or holds something else.
-    """
+    """Return the table that a YAML file holds."""
     try:
         with open_file(path) as stream:
             text = stream.read(LARGEST).decode("utf-8")
@@ -257,11 +253,7 @@ def as_yaml(table: Mapping[str, Any]) -> bytes:
 
 
 def number_in(path: Path, key: str, value: Any) -> tuple[float, float]:
-    """Return a value and its standard deviation (NaN if not given): a number, or a table of both.
-
-    Raises:
-        GroundedError: if it is something else.
-    """
+    """Return a value and its std (NaN if not given): a number, or a table of both."""
     table = value if isinstance(value, Mapping) else {"value": value}
     numbers: list[Any] = [table.get("value"), table.get("std", float("nan"))]
     if not all(isinstance(n, int | float) and not isinstance(n, bool) for n in numbers):

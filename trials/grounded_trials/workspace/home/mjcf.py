@@ -267,11 +267,7 @@ class XmlText:
     """An XML file, with its root."""
 
     def __init__(self, data: bytes, name: str) -> None:
-        """Parse a file.
-
-        Raises:
-            GroundedError: if it is not XML.
-        """
+        """Parse a file."""
         self.data = data
         kept = ElementTree.TreeBuilder(insert_comments=True, insert_pis=True)
         try:

@@ -93,11 +93,7 @@ class Config:
 
 
 def read_config(folder: Path) -> Config:
-    """Read and check the workspace's grounded.toml.
-
-    Raises:
-        GroundedError: naming the key, what was found and what was expected.
-    """
+    """Read and check the workspace's grounded.toml."""
     table = read_toml(folder / FILE)
     table.expect(one.name for one in fields(Config) if one.name not in ("file", "seen_in"))
     limits = table.sub("limits")
@@ -191,9 +187,6 @@ def set_keys(file: Path, table: str, **values: Any) -> None:
     """Replace keys in a table of grounded.toml; the rest of the file is unchanged.
 
     A value of None leaves the old one, an empty one removes the key.
-
-    Raises:
-        GroundedError: if the file can't be written.
     """
     import tomlkit
 

@@ -29,9 +29,6 @@ def load_module(
     """Load the module of a model, from a file in the workspace or by its import name.
 
     A name may be one among the entry points; `key` is that of grounded.toml, for messages.
-
-    Raises:
-        GroundedError: if it does not exist, lies outside the workspace, or fails while it runs.
     """
     if module:
         check_own(folder, [folder / FILE])
@@ -99,11 +96,7 @@ def _forget_neighbours(folder: Path, before: set[str]) -> None:
 
 
 def model_in(module: ModuleType) -> Model:
-    """Return the `model` of a module.
-
-    Raises:
-        GroundedError: if there is none, or it is not a Model.
-    """
+    """Return the `model` of a module."""
     found: Any = getattr(module, "model", None)
     if isinstance(found, Model):
         return found

@@ -26,12 +26,7 @@ from grounded_trials.workspace.user_files.config import Config
 
 
 def build_task(config: Config, model: Model, folder: Path) -> Task:
-    """Build the task that the files describe.
-
-    Raises:
-        GroundedError: for a name that is not in the model, or sizes that do not fit; the message
-            names the file and the key.
-    """
+    """Build the task that the files describe."""
     try:
         return _build(config, model, folder)
     except GroundedError as error:
@@ -39,11 +34,7 @@ def build_task(config: Config, model: Model, folder: Path) -> Task:
 
 
 def check_tables(config: Config, model: Model, rows: int) -> None:
-    """Check all of grounded.toml that a task is built from, whatever its target will be.
-
-    Raises:
-        GroundedError: as `build_task`.
-    """
+    """Check all of grounded.toml that a task is built from, whatever its target will be."""
     untracked = replace(config, task=replace(config.task, target="", horizon=rows - 1))
     build_task(untracked, model, config.file.parent)
 
@@ -129,9 +120,6 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
     Args:
         path: the CSV file.
         free: names of columns that may hold NaN: of inputs, beside the states of a run.
-
-    Raises:
-        GroundedError: naming the line and the column of a value that is not a number.
     """
     try:
         with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
@@ -183,11 +171,7 @@ def _numbers(
 def target_arrays(
     path: Path, states: list[str], inputs: list[str], dt: float, horizon: int
 ) -> tuple[Array, Array | None]:
-    """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None.
-
-    Raises:
-        GroundedError: for an unknown column, too few rows, or times off the control grid.
-    """
+    """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None."""
     names, values = read_target(path)
     for name in names[1:]:
         if name not in states and name not in inputs:
