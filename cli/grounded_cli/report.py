@@ -91,8 +91,9 @@ def report_text(findings: Findings) -> str:
     lines += _indented([f"{now.outcome}: {now.sentence}"])
 
     # errors by state, and what was diagnosed
-    for block in error_table(findings):
-        lines += ["", table(block.rows, block.header)]
+    errors = error_table(findings)
+    if errors.rows:
+        lines += ["", table(errors.rows, errors.header)]
     gap = findings.lines or [rendered(DIAGNOSE, findings.folder)]
     lines += ["", "gap to the model", *_indented(gap)]
     if (said := findings.told) is not None and said.rows:

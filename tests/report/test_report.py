@@ -190,8 +190,8 @@ def test_what_was_adopted_is_told_everywhere(learnt, cart):
     page = (w.reports / "report.html").read_text().replace("\xa0", " ")
     for text in (grounded("-C", learnt, "report").out, re.sub(r"<[^>]+>", "", page)):
         assert re.search(r"12\s+mm\s+instead\s+of\s+250\s+mm", text)
-    (block,) = parameter_table(gather(Folder(learnt)))
-    row = dict(zip(block.header, next(r for r in block.rows if r[0] == "mass"), strict=True))
+    made = parameter_table(gather(Folder(learnt)))
+    row = dict(zip(made.header, next(r for r in made.rows if r[0] == "mass"), strict=True))
     assert (row["in model.py"], row["now"]) == ("1.000", "1.400")
     assert row["diagnosed "].startswith("1.400 +- 0.020")
 

@@ -1,8 +1,8 @@
 """report.html: one self-contained page that needs no network and runs only its own scripts.
 
-Read `page` first; its sections are those of `report.tables`. Names and texts from files are never
-markup: the template `page.html` escapes them, and a content security policy allows only the two
-scripts whose hashes the page states. The page holds the figures as data; `page.js` draws each with
+Read `page` first, then `page.html`, the template with its sections. Names and texts from files are
+never markup: the template escapes them, and a content security policy allows only the two scripts
+whose hashes the page states. The page holds the figures as data; `page.js` draws each with
 Plotly when it comes into view. `plotly-basic.min.js` is Plotly's smallest bundle, unchanged (npm:
 plotly.js-basic-dist-min 4.1.1, MIT). It is a quarter of the size of the bundle in the Python
 package, so that pages open fast.
@@ -20,13 +20,31 @@ from typing import Any
 
 import numpy as np
 
-from grounded.diagnosis.telling import FINDINGS, credit_figure, instrument_lines, sentence
-from grounded.errors import needs
+from grounded.diagnosis.telling import (
+    FINDINGS,
+    credit_figure,
+    effect_table,
+    instrument_lines,
+    sentence,
+)
+from grounded.diagnosis.telling import error_table as held_out_table
+from grounded.errors import NextCommand, needs
 from grounded.figures.figure import Panel, label_lines, typeset
 from grounded.figures.interactive import PALETTE, packed
+from grounded.result import begun
+from grounded.search.difference import last_gain
+from grounded_trials.report.figures.runs import all_figures
 from grounded_trials.report.findings import Findings
-from grounded_trials.report.tables import about, counted, improved, sections
-from grounded_trials.wording import glued, placed, rendered
+from grounded_trials.report.tables import (
+    Table,
+    about,
+    candidate_table,
+    counted,
+    error_table,
+    improved,
+    parameter_table,
+)
+from grounded_trials.wording import glued, legend, placed, rendered
 from grounded_trials.workspace.next_step import DIAGNOSE
 
 
@@ -53,6 +71,14 @@ def page(findings: Findings) -> str:
         text = json.dumps({"panels": panels, "colours": PALETTE}, allow_nan=False)
         return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
+    found, gain = findings.diagnosis, last_gain(findings.history)
+    diagnosed = []
+    if found is not None and not found.no_cause:  # with too little data, what was fitted is nothing
+        diagnosed = [
+            ("Errors of held-out predictions", "held-out", Table(*held_out_table(found))),
+            ("Effects that were compared", "effects", Table(*effect_table(found))),
+        ]
+    candidates, left = candidate_table(findings)
     return jinja.from_string(_own("page.html")).render(
         findings=findings,
         about=about(findings),
@@ -60,7 +86,15 @@ def page(findings: Findings) -> str:
         improved=improved(findings),
         diagnose=rendered(DIAGNOSE, findings.folder),
         why=_why(findings),
-        sections=sections(findings),
+        figures={one.name: one for one in all_figures(findings)},
+        errors=error_table(findings),
+        gain=begun(gain.to_finding().sentence) if gain else "",
+        candidates=candidates,
+        left=left,
+        legend=begun(legend("", [t.candidate.iteration for t in findings.history])),
+        status=rendered(NextCommand("status"), findings.folder),
+        diagnosed=diagnosed,
+        parameters=parameter_table(findings),
         style=_own("page.css") + _roles(),
         scripts=scripts,
         hashes=[_hash(script) for script in scripts],
