@@ -21,7 +21,7 @@ from typing import Any, Literal
 import numpy as np
 
 from grounded.checks import finite, known, of_type, one_of, refused, unknown, whole_number, wrong
-from grounded.compile import System, system_of
+from grounded.compile import Kind, Signature, System, system_of
 from grounded.errors import alike
 from grounded.frozen import Array, readonly, wrapped
 
@@ -312,6 +312,18 @@ class Model:
             substeps=self.substeps,
             jacobian=self.jacobian,
         )
+
+    def steps(self, x: Array, u: Array, dt: float) -> Array:
+        """Return the next states (N, n) of a few samples: slowly, but nothing is compiled for it.
+
+        NaN where the function raises an arithmetic error.
+        """
+        function = self.derivative or self.step
+        assert function is not None
+        kind: Kind = "derivative" if self.derivative else "step"
+        names = (self.state_names, self.input_names, self.param_names)
+        signature = Signature(function, kind, *names).whole(self.integrator, self.substeps)
+        return signature.steps(x, u, self.values, dt)
 
     def difference(self, a: Array, b: Array) -> Array:
         """Return the difference a - b of states (..., n), with angles wrapped to [-pi, pi]."""

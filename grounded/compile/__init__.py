@@ -10,12 +10,11 @@ in which a function passes through them: `trace` (run once on expressions, diffe
 
 from __future__ import annotations
 
-import copyreg
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
-from grounded.compile.names import Named, where
+from grounded.compile.names import Named, Signature
 from grounded.compile.problem import (
     Backward,
     Descent,
@@ -28,27 +27,21 @@ from grounded.compile.problem import (
     System,
     deepest,
 )
-from grounded.compile.run.compiled import MAX_PLACES, CompiledSteps, CompiledSystem
-from grounded.compile.run.differenced import DifferencedSystem
-from grounded.compile.run.interpreted import Interpreted
-from grounded.compile.run.traced import TracedSystem
-from grounded.compile.trace.graph import TooLong
-from grounded.compile.trace.tracing import Signature, trace
 
 __all__ = [
     "Backward",
     "Descent",
     "DescentOptions",
+    "Kind",
     "Named",
     "Problem",
+    "Signature",
     "Status",
     "Swarm",
     "System",
     "deepest",
     "system_of",
 ]
-MAX_COMPILED = 30_000  # operations that kernels are written with, about 7 s of compiling
-MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 
 
 def system_of(
@@ -79,42 +72,9 @@ def system_of(
     Raises:
         GroundedError: if the function can't be a model of these names, naming its file and line.
     """
+    from grounded.compile.run.compiled import system_from  # slow, and all that is above may not ask
+
     signature = Signature(function, kind, tuple(states), tuple(inputs), tuple(params))
-    if kind == "derivative" and substeps > 1:
-        signature = replace(signature, kind="step", within=(integrator, substeps))
+    if substeps > 1:
+        signature = signature.whole(integrator, substeps)
     return system_from(replace(signature, jacobian=jacobian), integrator, derivatives)
-
-
-def system_from(signature: Signature, integrator: Integrator, derivatives: bool = True) -> System:
-    """The System of a function that is called so."""
-    if signature.jacobian is not None:
-        note = "not compiled: it is run as it is, with the derivatives that come with it"
-        return DifferencedSystem(signature, integrator, note)
-    found = trace(signature, None, 1.0)
-    if isinstance(found, str):
-        return DifferencedSystem(signature, integrator, f"not compiled, {found}")
-    if not derivatives and len(found.graph.live(found.outputs)) <= MAX_STEPS:
-        return CompiledSteps(signature, found, integrator, "")
-    system, place = CompiledSystem(signature, found, integrator), where(signature.function)
-    size = f"the derivatives of {system.n} states by {system.n + system.m} states and inputs"
-    if system.n * (system.n + system.m) <= MAX_PLACES:
-        try:
-            if (operations := system.operations) <= MAX_COMPILED:
-                return system
-            size = f"{operations:,} operations of {system.n} states"
-        except TooLong as error:
-            size = str(error)
-    slow = f"({place}): to compile {size} would take too long; it is planned with all the same"
-    if len(found.graph.live(found.outputs)) > MAX_STEPS:
-        return TracedSystem(signature, found, integrator, f"not compiled {slow}, more slowly")
-    note = f"compiled but for its derivatives {slow}, more slowly"
-    return CompiledSteps(signature, found, integrator, note)
-
-
-def _again(system: Interpreted) -> tuple[Callable[..., Any], tuple[Any, ...]]:
-    """In another process it is made again from the function: code and caches stay here."""
-    return system_from, (system.signature, system.integrator)
-
-
-for engine in (CompiledSteps, CompiledSystem, DifferencedSystem, TracedSystem):
-    copyreg.pickle(engine, _again)

@@ -8,7 +8,8 @@ it and the nearest name that exists.
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -16,7 +17,10 @@ from typing import Any
 import numpy as np
 
 from grounded.checks import refused, unknown, wrong
+from grounded.compile.problem import Integrator, Kind, integrated
 from grounded.errors import GroundedError
+from grounded.foreign import contained
+from grounded.frozen import Array
 
 _NOT_THE_USER = (str(Path(__file__).parents[1]), str(Path(np.__file__).parent), "<frozen")
 
@@ -66,6 +70,64 @@ class Named(Mapping[str, Any]):
                 f"{line_of(frame)}: a {what}", name, must="named", like=f"s.{next(iter(self))}"
             )
         return unknown(what, name, [*self], where=line_of(frame))
+
+
+@dataclass(frozen=True)
+class Signature:
+    """What a user's function is called with."""
+
+    function: Callable[..., Mapping[str, Any]]
+    kind: Kind
+    states: tuple[str, ...]
+    inputs: tuple[str, ...]
+    params: tuple[str, ...]
+    within: tuple[Integrator, int] | None = None  # a step made of so many steps of a derivative
+    jacobian: Callable[..., tuple[Any, Any]] | None = None  # the user's own f_x, f_u of a step
+
+    def whole(self, integrator: Integrator, count: int = 1) -> Signature:
+        """The same that returns the next state: a derivative, integrated in so many parts."""
+        if self.kind == "step":
+            return self
+        return replace(self, kind="step", within=(integrator, count))
+
+    def steps(self, x: Array, u: Array, p: Array, dt: float) -> Array:
+        """The next states (N, n) of a step, called sample by sample; NaN where that is an error."""
+        found, values = np.full(x.shape, np.nan), [np.float64(v) for v in p]
+        for k, (at, sent) in enumerate(zip(x, u, strict=True)):
+            try:
+                after = self.call(list(at), list(sent), values, np.float64(dt))
+            except (ArithmeticError, ValueError):
+                continue
+            check_names(after, self.states, self.function)
+            found[k] = [np.asarray(after[name], float).reshape(-1)[0] for name in self.states]
+        return found
+
+    @property
+    def sizes(self) -> tuple[int, int, int]:
+        """Numbers n, m, k of states, inputs and parameters."""
+        return len(self.states), len(self.inputs), len(self.params)
+
+    def call(
+        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any], dt: Any
+    ) -> Mapping[str, Any]:
+        """What the function, or a copy of it, returns for n, m and k values and dt."""
+        a, parameters = Named("input", self.inputs, u), Named("parameter", self.params, p)
+        with contained():
+            if self.within is not None:
+                return self._integrated(list(x), a, parameters, dt)
+            more = (dt,) if self.kind == "step" else ()
+            return self.function(Named("state", self.states, x), a, parameters, *more)
+
+    def _integrated(self, x: list[Any], a: Named, p: Named, dt: Any) -> Mapping[str, Any]:
+        """The next state by equal steps of Runge-Kutta or Euler within a control step."""
+        assert self.within is not None
+
+        def rate(at: list[Any]) -> list[Any]:
+            values = self.function(Named("state", self.states, at), a, p)
+            check_names(values, self.states, self.function)
+            return [values[name] for name in self.states]
+
+        return dict(zip(self.states, integrated(rate, x, dt, *self.within), strict=True))
 
 
 def line_of(frame: FrameType) -> str:

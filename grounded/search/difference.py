@@ -23,7 +23,6 @@ import numpy as np
 
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
-from grounded.places import true_values
 from grounded.policy import Policy
 from grounded.search.candidate import DOUBTFUL_GAIN, IMPROVED, Candidate, Tried
 from grounded.search.noise import noise_cost, noise_missed, sensor_noise
@@ -91,6 +90,8 @@ def worth_of_start(planner: Planner, policy: Policy, off: Array) -> float:
     True values behind late or filtered logs are off by as much: else the log would soon show the
     robot at s_0. NaN if the model fails from s_0, -inf if it fails from there only.
     """
+    from grounded.places import true_values
+
     problem = planner.feeding_back((policy,)).plan.problem(exact=True)
     moved, names, n = problem.start.copy(), planner.plan.model.state_names, len(off)
     moved[:n] += off

@@ -19,17 +19,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.checks import known
-from grounded.compile import Problem, deepest
+from grounded.compile import deepest
 from grounded.model import Model
 from grounded.policy import Policy
-from grounded.rollout import Rollout, simulate
-from grounded.solve.measured import measured_gains
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded.utility import Reward
 
 if TYPE_CHECKING:
+    from grounded.compile import Problem
     from grounded.effects import Effect, Library
+    from grounded.rollout import Rollout
     from grounded.search.first_policy import Tick
     from grounded.solve.ddp import Solution
 
@@ -151,6 +151,7 @@ class Planner:
         """
         from grounded.search.first_policy import cautious, first_policy
         from grounded.solve.ddp import sweep
+        from grounded.solve.measured import measured_gains
 
         policy, found = first_policy(self.engaged, caution, tick)
         if policy.gain is None or (self.plan.model.n == self.task.model.n and not self.widths):
@@ -173,7 +174,8 @@ def model_fingerprint(task: Task) -> str:
 
     It has 16 hex digits. Predictions at fixed points stand for the code of the dynamics.
     """
-    model, problem = task.model, task.problem(exact=True)
+    model = task.model
+    assert task.latency is not None
     digest = hashlib.sha256()
     digest.update(repr((model.state_names, model.input_names, model.param_names)).encode())
     around = np.arange(1, 8 * (model.n + model.m) + 1) * GOLDEN % 1.0 - 0.5
@@ -181,14 +183,21 @@ def model_fingerprint(task: Task) -> str:
     u = task.past + around[8 * model.n :].reshape(8, model.m)
     u = np.clip(u, task.low, task.high)
     with np.errstate(all="ignore"):
-        moved = problem.system.step(x, u, problem.p, problem.dt)
-    for array in (model.values, problem.delay, np.array([task.smoothing]), np.round(moved, 9)):
+        moved = model.steps(x, u, task.dt)
+    for array in (
+        model.values,
+        task.latency / task.dt,
+        np.array([task.smoothing]),
+        np.round(moved, 9),
+    ):
         digest.update(np.ascontiguousarray(array + 0.0).tobytes())
     return digest.hexdigest()[:16]
 
 
 def predicted(problem: Problem, policy: Policy) -> Rollout:
     """Simulate a robot's policy in a model that may have more states than the robot measures."""
+    from grounded.rollout import simulate
+
     angles = tuple(map(bool, problem.angles))
     depths = deepest(problem.depths, policy.depths)
     return simulate(problem, policy.laid_out(problem.system.states, angles, depths))

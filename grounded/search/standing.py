@@ -21,18 +21,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import NextCommand
-from grounded.figures.figure import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.difference import LUCK, Difference, judged, last_gain
-from grounded.search.pictures import search_figure
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.figures.figure import Figure
 
 
 class Phase(StrEnum):
@@ -210,6 +211,8 @@ class Standing(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of utilities by candidate and step sizes."""
+        from grounded.search.pictures import search_figure
+
         found = search_figure(self)
         return () if found is None else (found,)
 

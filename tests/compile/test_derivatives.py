@@ -7,8 +7,9 @@ from hypothesis import strategies as st
 
 from facts import holding
 from grounded.compile import system_of
+from grounded.compile.names import Signature
 from grounded.compile.run.traced import TracedSystem
-from grounded.compile.trace.tracing import Signature, trace
+from grounded.compile.trace.tracing import trace
 from grounded.effects import Library, wrap
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import flight_task

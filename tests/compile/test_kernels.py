@@ -9,11 +9,12 @@ from scipy.linalg import solve_discrete_are
 
 from grounded.compile import DescentOptions, system_of
 from grounded.compile.kernel_words import MAX_INPUTS
+from grounded.compile.names import Signature
 from grounded.compile.problem import Controls
 from grounded.compile.run.compiled import Kernels
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
-from grounded.compile.trace.tracing import Signature, Variant, trace
+from grounded.compile.trace.tracing import Variant, trace
 from grounded.engine import Engine, each, running
 from grounded.solve.ddp import descended, solve
 from problems import SPECS, plain, problem
@@ -144,7 +145,7 @@ def test_many_models_in_threads():
 
 
 def test_too_many_operations_are_not_compiled(monkeypatch):
-    import grounded.compile as package
+    from grounded.compile.run import compiled as package
 
     monkeypatch.setattr(package, "MAX_COMPILED", 20)
     monkeypatch.setattr("grounded.compile.run.compiled.UNCOUNTED", 0)

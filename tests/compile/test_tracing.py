@@ -9,8 +9,8 @@ import pytest
 
 from facts import holding
 from grounded.compile import Named, system_of
+from grounded.compile.names import Signature
 from grounded.compile.run.differenced import DifferencedSystem
-from grounded.compile.trace.tracing import Signature
 from grounded.errors import GroundedError
 from problems import SPECS, system
 

@@ -8,11 +8,12 @@ What can't be compiled, or would take too long to, is left to the interpreted tw
 
 from __future__ import annotations
 
+import copyreg
 import ctypes
 import hashlib
 import struct
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import groupby
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +33,7 @@ from grounded.compile.kernel_words import (
     TURN,
     Layout,
 )
+from grounded.compile.names import Signature, where
 from grounded.compile.problem import (
     STATUSES,
     Backward,
@@ -42,6 +44,7 @@ from grounded.compile.problem import (
     Problem,
     Samples,
     Swarm,
+    System,
 )
 from grounded.compile.run import jit
 from grounded.compile.run.arguments import (
@@ -52,9 +55,11 @@ from grounded.compile.run.arguments import (
     side_by_side,
     table,
 )
+from grounded.compile.run.differenced import DifferencedSystem
+from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.run.traced import TracedSystem
 from grounded.compile.trace.graph import TooLong
-from grounded.compile.trace.tracing import Signature, Trace, Variant
+from grounded.compile.trace.tracing import Trace, Variant, trace
 from grounded.frozen import Array
 
 if TYPE_CHECKING:
@@ -64,6 +69,8 @@ Words = ctypes.c_int64 * len(BATCH)
 RESULTS = BATCH[6:]
 POINT = struct.Struct(f"=3q2dq{len(RESULTS)}q")  # the words of a batch
 UNCOUNTED = 600  # operations of a model, or places of its Jacobian, of which no count is needed
+MAX_COMPILED = 30_000  # operations that kernels are written with, about 7 s of compiling
+MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
 FORMAT = 1  # raise when kernels change their words or their meaning
 
@@ -314,3 +321,41 @@ def _policy(by: Controls) -> dict[str, Any]:
     """Words of a policy: those that are not given are null."""
     given = by._asdict() | {"K": None if by.zbar is None else by.K}
     return {name: 0 if array is None else plain(array) for name, array in given.items()}
+
+
+# --- which engine -------------------------------------------------------------------------------
+
+
+def system_from(signature: Signature, integrator: Integrator, derivatives: bool = True) -> System:
+    """The System of a function that is called so."""
+    if signature.jacobian is not None:
+        note = "not compiled: it is run as it is, with the derivatives that come with it"
+        return DifferencedSystem(signature, integrator, note)
+    found = trace(signature, None, 1.0)
+    if isinstance(found, str):
+        return DifferencedSystem(signature, integrator, f"not compiled, {found}")
+    if not derivatives and len(found.graph.live(found.outputs)) <= MAX_STEPS:
+        return CompiledSteps(signature, found, integrator, "")
+    system, place = CompiledSystem(signature, found, integrator), where(signature.function)
+    size = f"the derivatives of {system.n} states by {system.n + system.m} states and inputs"
+    if system.n * (system.n + system.m) <= MAX_PLACES:
+        try:
+            if (operations := system.operations) <= MAX_COMPILED:
+                return system
+            size = f"{operations:,} operations of {system.n} states"
+        except TooLong as error:
+            size = str(error)
+    slow = f"({place}): to compile {size} would take too long; it is planned with all the same"
+    if len(found.graph.live(found.outputs)) > MAX_STEPS:
+        return TracedSystem(signature, found, integrator, f"not compiled {slow}, more slowly")
+    note = f"compiled but for its derivatives {slow}, more slowly"
+    return CompiledSteps(signature, found, integrator, note)
+
+
+def _again(system: Interpreted) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+    """In another process it is made again from the function: code and caches stay here."""
+    return system_from, (system.signature, system.integrator)
+
+
+for engine in (CompiledSteps, CompiledSystem, DifferencedSystem, TracedSystem):
+    copyreg.pickle(engine, _again)

@@ -33,7 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile.names import raised_at, where
+from grounded.compile.names import Signature, raised_at, where
 from grounded.compile.problem import (
     STOP,
     Backward,
@@ -46,7 +46,6 @@ from grounded.compile.problem import (
     System,
     integrated,
 )
-from grounded.compile.trace.tracing import Signature
 from grounded.frozen import Array, wrapped
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))  # of differences in double precision

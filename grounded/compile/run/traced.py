@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.checks import refused
+from grounded.compile.names import Signature
 from grounded.compile.problem import STAGES, Integrator, Samples
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import Interpreted
 from grounded.compile.trace.graph import TooLong
-from grounded.compile.trace.tracing import Signature, Trace, Variant, trace
+from grounded.compile.trace.tracing import Trace, Variant, trace
 from grounded.frozen import Array
 
 CHUNK = 1024  # samples at once

@@ -8,7 +8,7 @@ the slower path that is taken instead.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -16,55 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.checks import refused
-from grounded.compile.names import Named, check_names, raised_at, wrong_value
-from grounded.compile.problem import Integrator, Kind, integrated
+from grounded.compile.names import Signature, check_names, raised_at, wrong_value
 from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
 from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
 from grounded.errors import GroundedError
-from grounded.foreign import contained
 from grounded.frozen import Array
-
-
-@dataclass(frozen=True)
-class Signature:
-    """What a user's function is called with."""
-
-    function: Callable[..., Mapping[str, Any]]
-    kind: Kind
-    states: tuple[str, ...]
-    inputs: tuple[str, ...]
-    params: tuple[str, ...]
-    within: tuple[Integrator, int] | None = None  # a step made of so many steps of a derivative
-    jacobian: Callable[..., tuple[Any, Any]] | None = None  # the user's own f_x, f_u of a step
-
-    @property
-    def sizes(self) -> tuple[int, int, int]:
-        """Numbers n, m, k of states, inputs and parameters."""
-        return len(self.states), len(self.inputs), len(self.params)
-
-    def call(
-        self, x: Sequence[Any], u: Sequence[Any], p: Sequence[Any], dt: Any
-    ) -> Mapping[str, Any]:
-        """What the function, or a copy of it, returns for n, m and k values and dt."""
-        a, parameters = Named("input", self.inputs, u), Named("parameter", self.params, p)
-        with contained():
-            if self.within is not None:
-                return self._integrated(list(x), a, parameters, dt)
-            more = (dt,) if self.kind == "step" else ()
-            return self.function(Named("state", self.states, x), a, parameters, *more)
-
-    def _integrated(self, x: list[Any], a: Named, p: Named, dt: Any) -> Mapping[str, Any]:
-        """The next state by equal steps of Runge-Kutta or Euler within a control step."""
-        assert self.within is not None
-
-        def rate(at: list[Any]) -> list[Any]:
-            values = self.function(Named("state", self.states, at), a, p)
-            check_names(values, self.states, self.function)
-            return [values[name] for name in self.states]
-
-        return dict(zip(self.states, integrated(rate, x, dt, *self.within), strict=True))
 
 
 @dataclass(frozen=True, eq=False)

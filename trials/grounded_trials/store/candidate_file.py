@@ -20,7 +20,6 @@ from grounded.errors import NextCommand
 from grounded.frozen import Array
 from grounded.onboard import WIDTH, fault
 from grounded.policy import Policy
-from grounded_trials.formats.mcap_writer import McapWriter
 from grounded_trials.formats.protobuf import encode_doubles, encode_lists
 from grounded_trials.store.own_files import (
     CANDIDATE,
@@ -74,6 +73,8 @@ def encoded_candidate(
     )
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
     times = np.rint(np.arange(H + 1) * policy.dt * 1e9).astype(np.int64)
+    from grounded_trials.formats.mcap_writer import McapWriter
+
     stream = io.BytesIO()
     log = McapWriter(stream)
     log.metadata("grounded", table)

@@ -18,7 +18,6 @@ import numpy as np
 from grounded.checks import of_shape, refused, wrong
 from grounded.frozen import Array
 from grounded.trial import Trial
-from grounded_trials.formats.mcap_writer import McapWriter
 from grounded_trials.formats.protobuf import encode_doubles
 from grounded_trials.plain_file import unwritable
 from grounded_trials.store.own_files import TRIAL, Meta, Units, read_own, stated, with_units
@@ -61,6 +60,8 @@ class TrialWriter:
         start_states: Mapping[str, float] | None = None,
         start_ns: int = 0,
     ) -> None:
+        from grounded_trials.formats.mcap_writer import McapWriter
+
         held = None if start_inputs is None else np.asarray(start_inputs, float).tolist()
         table = stated(
             TRIAL,

@@ -21,7 +21,6 @@ import numpy as np
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, found
 from grounded.search.planner import model_fingerprint
-from grounded.share import Share, share_of
 from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
@@ -29,6 +28,7 @@ from grounded_trials.workspace.identity import named_trials, sha256
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
+    from grounded.share import Share
     from grounded.trial import Trial
 
 FILE = "diagnosis.json"  # in reports/
@@ -85,6 +85,8 @@ def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
         workspace: the workspace.
         names: short names of the trials; empty: all usable ones.
     """
+    from grounded.share import share_of
+
     used = diagnosable(workspace)
     names = named_trials(workspace, names, [trial.id for trial in used])
     share = share_of([trial for trial in used if not names or trial.id in names])

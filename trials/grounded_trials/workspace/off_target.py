@@ -18,7 +18,6 @@ import numpy as np
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
 from grounded.model import Model
-from grounded.places import rate_states
 from grounded.result import Document, or_zero
 from grounded.task import Task
 from grounded.trial import Trial
@@ -157,6 +156,8 @@ def position_names(model: Model) -> list[str]:
 
 def rates_beside(model: Model, names: Collection[str]) -> set[str]:
     """Return which of some states are the velocities of others, or of a position among them."""
+    from grounded.places import rate_states
+
     known = {model.state_names[i] for role in RATES for i in roles_of(model).get(role, ())}
     moved = {rate for place, rate in rate_states(model).items() if place in names}
     return {*names} & (moved | (known if {*position_names(model)} & {*names} else set()))

@@ -19,14 +19,12 @@ from typing import TYPE_CHECKING
 
 import grounded
 from grounded.checks import refused
-from grounded.compile.run.jit import store, stored
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, standing
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.identity import StoredTrial, other_task
-from grounded_trials.workspace.last_diagnosis import readable_diagnosis, since_diagnosis
 
 if TYPE_CHECKING:
     from grounded.search.candidate import Candidate
@@ -70,6 +68,8 @@ def answered(workspace: Folder, now: Standing) -> Standing:
     """Return the standing, which asks for no diagnosis if there is one of all that it knows."""
     if not now.asks:
         return now
+    from grounded_trials.workspace.last_diagnosis import readable_diagnosis, since_diagnosis
+
     if (found := readable_diagnosis(workspace.reports)) is None:
         return now
     return now.answered() if since_diagnosis(workspace, found).settled else now
@@ -125,6 +125,8 @@ def planned(
 
 def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing | None:
     """Return the end of a search that was planned before; None if it goes on or is not known."""
+    from grounded.compile.run.jit import stored
+
     kept = stored(_place(workspace), KIND)
     if kept is None:
         return None
@@ -138,6 +140,8 @@ def remember_end(workspace: Folder, contents: Contents, now: Standing) -> None:
     """Keep the end of a search, unless it goes on or a candidate was refused, with its reasons."""
     if now.ending is Ending.NONE or now.ending in UNSAID:
         return
+    from grounded.compile.run.jit import store
+
     findings = [one.to_json() for one in now.findings]
     document = {"of": _digest(workspace, contents), "ending": now.ending, "findings": findings}
     store(_place(workspace), json.dumps(document).encode(), KIND)
