@@ -29,7 +29,7 @@ from grounded.diagnosis.error_report import (
     lost_most,
 )
 from grounded.diagnosis.levels import SHOWS
-from grounded.diagnosis.telling import LINES, NEXT, gap_figures, instrument_lines, told
+from grounded.diagnosis.telling import LINES, NEXT, accuracy_figure, instrument_lines, told
 from grounded.errors import NextCommand
 from grounded.figures.figure import Figure
 from grounded.findings import Finding, found
@@ -429,8 +429,9 @@ class Diagnosis(Document):
         return document
 
     def figures(self) -> Sequence[Figure]:
-        """Return figures: predictions before and after, and the credit."""
-        return gap_figures(self)
+        """Return the figure of predictions before and after, if there is one."""
+        drawn = accuracy_figure(self)
+        return [] if drawn is None else [drawn]
 
     def _repr_html_(self) -> str:
         """Return what is told, with the sensors' faults and the table; the rest is folded."""

@@ -24,7 +24,7 @@ from grounded.diagnosis.error_report import (
     telling,
 )
 from grounded.diagnosis.levels import ABOVE, SHOWS
-from grounded.figures.figure import Figure, Panel, bars, curve, panel
+from grounded.figures.figure import Figure, Panel, curve, panel
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
 from grounded.result import figure, measured, number, or_zero, percent, shown
@@ -271,7 +271,6 @@ def values_of(row: Ranked) -> str:
     )
 
 
-MOST_BARS = 12  # bars
 WHOLE = "whole trial"
 APART_BY = 2.0  # where errors over whole trials are drawn, in units of the longest horizon
 ROLES = {  # of the columns of prediction errors
@@ -283,18 +282,13 @@ ROLES = {  # of the columns of prediction errors
 }
 
 
-def gap_figures(diagnosis: Diagnosis) -> list[Figure]:
-    """Return the figures of a diagnosis, most important first; none if no cause can be named."""
-    if diagnosis.no_cause:
-        return []
-    found = (accuracy_figure(diagnosis), credit_figure(diagnosis))
-    return [figure for figure in found if figure is not None]
-
-
 def accuracy_figure(diagnosis: Diagnosis) -> Figure | None:
-    """Return the prediction errors without and with the diagnosis, in each state's unit."""
+    """Return the prediction errors without and with the diagnosis, in each state's unit.
+
+    None if there are none, or if no cause can be named.
+    """
     errors = diagnosis.prediction_error
-    if not errors:
+    if diagnosis.no_cause or not errors:
         return None
     panels = _over_horizons(errors, columns_told(diagnosis))
     if not panels:
@@ -329,11 +323,3 @@ def _over_horizons(errors: Sequence[RulerRow], columns: Mapping[str, str]) -> li
             label, across = f"{channel} [{unit}]" if unit else channel, "predicted ahead [s]"
             panels.append(panel(label, across, unit, curves, log=True, x_ticks=ticks))
     return panels
-
-
-def credit_figure(diagnosis: Diagnosis) -> Figure | None:
-    """Return each cause's share of the gain; None if there is no cause."""
-    if not diagnosis.credit:
-        return None
-    shares = [(c.of, c.share, percent(c.share), "best") for c in diagnosis.credit[:MOST_BARS]]
-    return Figure("credit", "What each is worth", "", [bars("Share of the gain", shares)])

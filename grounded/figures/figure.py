@@ -1,14 +1,13 @@
 """Figures as Plotly's own data: a page, a notebook and a picture draw the same traces.
 
-`curve` and `marks` make the contents of a `panel`, `bars` one of horizontal bars: traces and a
-layout as Plotly's JSON has them, with arrays in place of lists. Whatever has a name is in the
+`curve` and `marks` make the contents of a `panel`: traces and a layout as Plotly's JSON has them,
+with arrays in place of lists. Whatever has a name is in the
 legend of its figure. Colours are roles ("@best", or "@best/0.15" with an opacity), so that a page
 follows the reader's light or dark mode. No function here needs Plotly.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
@@ -45,8 +44,6 @@ TYPESET = {"^2": "²", "^3": "³", "->": "→", "+-": "±"}
 SMALLEST_RANGE = 1e-12  # range below which differences are rounding errors
 MOST_POINTS = 1600  # most points of a curve
 CONTEXT = 300  # most points of a curve that is only context
-LETTER = 0.045  # width of a letter of a bar's text, as a share of the longest bar
-LABEL_LETTERS = 26  # most letters in a line of a bar's label
 TICKS = 5  # most ticks of a logarithmic axis
 Trace = dict[str, Any]
 
@@ -68,12 +65,12 @@ class Panel:
     data: Sequence[Trace]
     layout: Mapping[str, Any] = field(default_factory=dict)
     note: str = ""  # text behind the title
-    kind: str = ""  # time or forecast: x is a time; path: positions of a run; bars
+    kind: str = ""  # time or forecast: x is a time; path: positions of a run
 
     @property
     def curves(self) -> list[Trace]:
-        """The traces that are no marks and no bars."""
-        return [t for t in self.data if t["meta"]["style"] not in (*SYMBOLS, "bar")]
+        """The traces that are no marks."""
+        return [t for t in self.data if t["meta"]["style"] not in SYMBOLS]
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,51 +338,6 @@ def _axis(name: str, low: float, high: float) -> dict[str, Any]:
         "title": {"text": name, "standoff": 6}, "range": [low, high], "gridcolor": "@grid",
         "zeroline": False, "linecolor": "@grid", "automargin": True,
     }  # fmt: skip
-
-
-def bars(title: str, rows: Sequence[tuple[str, float, str, str]]) -> Panel:
-    """Return horizontal bars from zero, one below the other.
-
-    Args:
-        title: of the panel.
-        rows: label, value, the text behind the bar, and role of each.
-    """
-    labels, values, texts, roles = zip(*rows[::-1], strict=True)  # Plotly's first is the lowest
-    lengths = np.where(np.isfinite(values), values, 0.0)
-    most = float(np.abs(lengths).max()) or 1.0
-    room = np.array([most * (0.05 + LETTER * len(text)) for text in texts])
-    ends = lengths + np.where(lengths < 0, -room, room)
-    trace = {
-        "type": "bar", "orientation": "h", "x": lengths, "y": list(range(len(rows))),
-        "text": [*texts], "textposition": "outside", "cliponaxis": False,
-        "marker": {"color": [f"@{role}" for role in roles]}, "hoverinfo": "skip", "name": "",
-        "textfont": {"color": "@text"}, "meta": {"role": "", "trial": "", "style": "bar"},
-    }  # fmt: skip
-    reached = [min(float(ends.min()), 0.0), max(float(ends.max()), 0.0)]
-    across = {"range": reached, "visible": False, "fixedrange": True}
-    up = {
-        "tickvals": trace["y"], "ticktext": [in_lines(label) for label in labels],
-        "automargin": True, "showgrid": False, "zeroline": False, "fixedrange": True,
-    }  # fmt: skip
-    return Panel(title, [trace], {"xaxis": across, "yaxis": up}, kind="bars")
-
-
-def in_lines(label: str) -> str:
-    """Break a label that is too long for a small panel, after a blank, a colon or a plus."""
-    if len(label) <= LABEL_LETTERS:
-        return label
-    lines = [""]
-    for part in re.findall(r"[^ :+]+[ :+]?", label):
-        if lines[-1] and len(lines[-1] + part.rstrip()) > LABEL_LETTERS:
-            lines.append("")
-        lines[-1] += part
-    return "<br>".join(line.rstrip() for line in lines)
-
-
-def label_lines(panel: Panel) -> int:
-    """Return in how many lines the longest label of bars is broken."""
-    labels: Sequence[str] = panel.layout["yaxis"]["ticktext"]
-    return max(label.count("<br>") + 1 for label in labels)
 
 
 def key_trace(key: Key) -> Trace:

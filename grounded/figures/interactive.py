@@ -1,23 +1,18 @@
-"""Figures for the reader: arrays `packed` for a page, `notebook_figure` for Jupyter."""
+"""Figures in colours, and `notebook_figure`: what `.plot()` returns."""
 
 from __future__ import annotations
 
-import base64
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from grounded.errors import needs
-from grounded.figures.figure import COLOURS, Figure, Panel, key_trace, label_lines, rgb
-from grounded.frozen import Array
+from grounded.figures.figure import COLOURS, Figure, key_trace, rgb
 
 PALETTE = COLOURS | {  # every role's colour on white and on black
     "text": ("#1a1a1a", "#e8e8e8"),
     "grid": ("#e3e3e3", "#31363b"),
     "paper": ("#ffffff", "#16181b"),
 }
-LETTER = 0.008  # width of a letter of a bar's label, as a share of a figure
 HEIGHT, SPACE = 200, 100  # of a row, and between rows [px]
 
 
@@ -34,12 +29,6 @@ def coloured(value: Any, dark: bool = False) -> Any:
     return f"rgba({','.join(map(str, rgb(colour)))},{opacity})" if opacity else colour
 
 
-def packed(array: Array) -> dict[str, str]:
-    """Return an array as Plotly's JSON has typed ones: float32 in base 64, NaN if not finite."""
-    values = np.where(np.isfinite(array), array, np.nan).astype("<f4")
-    return {"dtype": "f4", "bdata": base64.b64encode(values.tobytes()).decode()}
-
-
 def notebook_figure(figures: Sequence[Figure]) -> Any:
     """Return all panels of some figures as one Plotly figure, two side by side.
 
@@ -54,14 +43,11 @@ def notebook_figure(figures: Sequence[Figure]) -> Any:
     columns, rows = min(2, len(panels)), -(-len(panels) // 2)
     if not panels:
         return Drawn()
-    heights = [max(_tall(one) for one in panels[2 * k : 2 * k + 2]) for k in range(rows)]
+    total = (HEIGHT + SPACE) * rows
     titles = [f"{p.title}<br><sub>{p.note}</sub>" if p.note else p.title for p in panels]
-    labels = [text for p in panels[1::2] for text in p.layout["yaxis"].get("ticktext", ())]
-    longest = max((len(part) for text in labels for part in text.split("<br>")), default=0)
     made = make_subplots(
-        rows=rows, cols=columns, subplot_titles=titles, row_heights=heights,
-        horizontal_spacing=min(max(0.12, LETTER * longest), 0.4),
-        vertical_spacing=SPACE / (sum(heights) + SPACE * rows),
+        rows=rows, cols=columns, subplot_titles=titles, horizontal_spacing=0.12,
+        vertical_spacing=SPACE / total,
     )  # fmt: skip
 
     # the traces, each name once in the legend
@@ -86,17 +72,9 @@ def notebook_figure(figures: Sequence[Figure]) -> Any:
         if all(key.name != name for _, name in named):  # rules and bands are no traces
             made.add_trace(coloured(key_trace(key)))
 
-    total = sum(heights) + SPACE * rows + 80
     made.update_layout(
-        height=total, template="plotly_white", margin={"t": 90, "b": 40, "l": 80},
+        height=total + 80, template="plotly_white", margin={"t": 90, "b": 40, "l": 80},
         title={"text": figures[0].title} if len(figures) == 1 else None,
-        legend={"orientation": "h", "yanchor": "top", "y": -70 / total}, showlegend=True,
+        legend={"orientation": "h", "yanchor": "top", "y": -70 / (total + 80)}, showlegend=True,
     )  # fmt: skip
     return made
-
-
-def _tall(panel: Panel) -> int:
-    """Return the height of a panel's plot [px]."""
-    if panel.kind != "bars":
-        return HEIGHT
-    return max((4 + 15 * label_lines(panel)) * len(panel.data[0]["y"]), 60)

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from grounded.diagnosis.error_report import Credit, RulerRow
+from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.parts import Diagnosis, Verdict
-from grounded.diagnosis.telling import accuracy_figure, credit_figure
+from grounded.diagnosis.telling import accuracy_figure
 from grounded.experiments.pendulum import pendulum_task
 from grounded.figures.figure import Figure, curve, log_ticks, marks, panel, rule
 from grounded.model import Model
@@ -146,7 +146,7 @@ def test_a_logarithmic_axis_says_its_magnitude(low, span):
     assert all(low - 0.05 <= np.log10(tick) <= low + span + 0.05 for tick in ticks)
 
 
-def test_the_worth_of_each_effect_and_errors_in_the_unit_of_the_state_are_drawn():
+def test_errors_are_drawn_in_the_unit_of_the_state():
     row = RulerRow(
         horizon_s=1.0,
         held_out="trials",
@@ -156,20 +156,11 @@ def test_the_worth_of_each_effect_and_errors_in_the_unit_of_the_state_are_drawn(
         with_effects={"x": 0.1, "v": 0.05},
         noise_floor={"x": 0.05, "v": 0.04},
     )
-    credit = (Credit("delay:u", share=0.9), Credit("dead_zone:u", share=0.1))
     verdict = Verdict("several", ("delay:u", "dead_zone:u"), ("late", "dry"))
-    found = Diagnosis(verdict, credit=credit, prediction_error=(row,))
-    (share,) = credit_figure(found).panels
-    assert _bars(share) == [("delay:u", 0.9), ("dead_zone:u", 0.1)]
+    found = Diagnosis(verdict, prediction_error=(row,))
     (x, v) = accuracy_figure(found).panels
     errors = sorted(float(one["y"][0]) for one in x.curves)
     assert errors == [0.05, 0.1, 0.1, 0.2] and v.title.startswith("v")
-
-
-def _bars(panel):
-    """The label and the value of each bar, from the top."""
-    labels, (trace,) = panel.layout["yaxis"]["ticktext"], panel.data
-    return [*zip(labels[::-1], trace["x"][::-1].tolist(), strict=True)]
 
 
 def test_few_candidates_are_the_first_the_improvements_and_the_latest():

@@ -11,7 +11,6 @@ from grounded.figures.figure import Figure, Key, Panel, Trace, key_trace, typese
 from grounded.figures.interactive import PALETTE
 
 WIDE, HIGH, SQUARE = 4.8, 2.7, 4.4  # [inch] of a panel
-HEAD, ROW = 0.5, 0.27  # [inch] of a title above bars, and of a bar
 DPI = 200
 MARKERS = {"circle": "o", "circle-open": "o", "x-thin": "x", "line-ew": "_"}
 LINE, MARK = 0.8, 0.7  # points of a pixel of a line's width, and of a mark's size
@@ -42,7 +41,8 @@ def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIG
     panels = figure.panels
     columns = columns or min(3 if len(panels) > 4 else 2, max(len(panels), 1))
     rows = [panels[i : i + columns] for i in range(0, len(panels), columns)]
-    heights = [max(_height(panel, size[1]) for panel in row) for row in rows] or [1.0]
+    square = [any("scaleanchor" in panel.layout["yaxis"] for panel in row) for row in rows]
+    heights = [SQUARE if one else size[1] for one in square] or [1.0]
     with rc_context(STYLE):
         wide = max(columns, 1.6) * size[0]
         caption = typeset(textwrap.fill(figure.caption, round(wide * PER_INCH)))
@@ -52,7 +52,7 @@ def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIG
         grid = sheet.add_gridspec(len(heights), columns, height_ratios=heights)
         for i, row in enumerate(rows):
             for j, panel in enumerate(row):
-                _draw(sheet.add_subplot(grid[i, j]), panel, heights[i])
+                _draw(sheet.add_subplot(grid[i, j]), panel)
         handles = [Line2D([], [], label=key.name, **_look(key_trace(key))) for key in _keys(figure)]
         if handles:
             sheet.legend(
@@ -66,12 +66,6 @@ def png(figure: Figure, columns: int = 0, size: tuple[float, float] = (WIDE, HIG
     return stream.getvalue()
 
 
-def _height(panel: Panel, usual: float) -> float:
-    if panel.kind == "bars":
-        return HEAD + ROW * len(panel.data[0]["y"])
-    return SQUARE if "scaleanchor" in panel.layout["yaxis"] else usual
-
-
 def _keys(figure: Figure) -> list[Key]:
     """Return the legend; many single trials become one entry."""
     single = [key for key in figure.key if key.trial]
@@ -81,8 +75,8 @@ def _keys(figure: Figure) -> list[Key]:
     return [*kept, Key(single[0].role, f"{len(single)} other trials")]
 
 
-def _draw(axes: Any, panel: Panel, height: float) -> None:
-    """Draw a panel into axes of a height [inch], which makes bars of one row equally thick."""
+def _draw(axes: Any, panel: Panel) -> None:
+    """Draw a panel."""
     # the title, and the note between it and the axes
     note = typeset(textwrap.fill(panel.note, NOTE))
     room = 1.2 * SMALL * (note.count("\n") + 1) if note else 0.0
@@ -99,12 +93,7 @@ def _draw(axes: Any, panel: Panel, height: float) -> None:
         else:
             axes.axhline(shape["y0"], **_look(shape))
     for trace in panel.data:
-        if trace["type"] == "bar":
-            drawn = axes.barh(
-                trace["y"], trace["x"], color=[*map(_colour, trace["marker"]["color"])]
-            )
-            axes.bar_label(drawn, trace["text"], padding=3)
-        elif trace.get("visible", True):
+        if trace.get("visible", True):
             _trace(axes, trace)
 
     # the axes
@@ -113,13 +102,6 @@ def _draw(axes: Any, panel: Panel, height: float) -> None:
         _axis(axes, name, layout[f"{name}axis"], grows=equal)
     if equal:
         axes.set_aspect("equal", adjustable="datalim")
-    if panel.kind == "bars":
-        count = len(panel.data[0]["y"])
-        axes.set_ylim(count - max(round((height - HEAD) / ROW), count) - 0.5, count - 0.5)
-        axes.xaxis.set_visible(False)
-        axes.grid(False)
-        axes.tick_params(left=False)
-        axes.spines["bottom"].set_visible(False)
 
 
 def _axis(axes: Any, name: str, axis: dict[str, Any], grows: bool) -> None:

@@ -7,7 +7,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from grounded.diagnosis.telling import gap_figures
+from grounded.diagnosis.telling import accuracy_figure
 from grounded.figures.figure import (
     STEPS,
     Figure,
@@ -46,7 +46,7 @@ def all_figures(findings: Findings) -> tuple[Figure, ...]:
     runs = (path_figure, state_figure, input_figure, error_figure, bias_figure)
     made = [search_figure(findings.standing), *(draw(findings) for draw in runs)]
     if findings.diagnosis is not None:
-        made += gap_figures(findings.diagnosis)
+        made.append(accuracy_figure(findings.diagnosis))
     made += forecast_figures(findings)
     return tuple(figure for figure in made if figure is not None)
 

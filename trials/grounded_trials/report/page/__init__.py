@@ -22,15 +22,14 @@ import numpy as np
 
 from grounded.diagnosis.telling import (
     FINDINGS,
-    credit_figure,
     effect_table,
     instrument_lines,
     sentence,
 )
 from grounded.diagnosis.telling import error_table as held_out_table
 from grounded.errors import NextCommand, needs
-from grounded.figures.figure import Panel, label_lines, typeset
-from grounded.figures.interactive import PALETTE, packed
+from grounded.figures.figure import Panel, typeset
+from grounded.figures.interactive import PALETTE
 from grounded.result import begun
 from grounded.search.difference import last_gain
 from grounded_trials.report.figures.runs import all_figures
@@ -146,15 +145,14 @@ def _plain(value: Any) -> Any:
         return {key: _plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return packed(value)
+    if isinstance(value, np.ndarray):  # as Plotly's JSON has typed ones, NaN if not finite
+        numbers = np.where(np.isfinite(value), value, np.nan).astype("<f4")
+        return {"dtype": "f4", "bdata": base64.b64encode(numbers.tobytes()).decode()}
     return float(value) if isinstance(value, np.floating) else typeset(value)
 
 
 def _height(panel: Panel) -> int:
     """Return the height of a panel in the page [px]."""
-    if panel.kind == "bars":
-        return 30 + max(26, 16 * label_lines(panel)) * len(panel.data[0]["y"])
     return 420 if panel.kind == "path" else 240
 
 
@@ -167,7 +165,7 @@ def _roles() -> str:
 
 
 def _why(findings: Findings) -> dict[str, Any]:
-    """Return what is told of the diagnosis, and the credit figure; {} if undiagnosed."""
+    """Return what is told of the diagnosis; {} if undiagnosed."""
     diagnosis, said = findings.diagnosis, findings.told
     if diagnosis is None or said is None:
         return {}
@@ -179,5 +177,4 @@ def _why(findings: Findings) -> dict[str, Any]:
         "header": said.header,
         "preflight": instrument_lines(diagnosis.preflight),
         "notes": [sentence(one) for one in said.findings[FINDINGS:]],
-        "credit": credit_figure(diagnosis),
     }

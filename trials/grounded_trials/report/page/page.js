@@ -54,8 +54,8 @@
     });
     const own = plot.layout || {};
     const shared = {
-      showlegend: false, autosize: true, dragmode: kind === "bars" ? false : "zoom",
-      hovermode: kind === "time" || kind === "forecast" ? "x unified" : kind === "bars" ? false : "closest",
+      showlegend: false, autosize: true, dragmode: "zoom",
+      hovermode: kind === "time" || kind === "forecast" ? "x unified" : "closest",
       margin: { l: 8, r: 12, t: 6, b: 8, pad: 2 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
       font: { color: coloured("@text"), size: 12 }, hoverlabel: { namelength: -1, font: { size: 12 } },
       modebar: { bgcolor: "rgba(0,0,0,0)", color: "#888", activecolor: coloured("@best") },
@@ -64,28 +64,7 @@
     for (const axis of ["xaxis", "yaxis"]) {
       zoomed[axis] = { ...coloured(layout[axis]), ...(own[axis] && plot.zoomed ? { range: own[axis].range } : {}) };
     }
-    if (kind === "bars") zoomed.xaxis = fitted(plot, zoomed.xaxis);
     return [traces, { ...shared, ...coloured(layout), ...zoomed }];
-  };
-  // Bars are as long as the texts behind them and the labels before them leave room for.
-  const pen = document.createElement("canvas").getContext("2d");
-  const fitted = (plot, axis) => {
-    const { data: [bars], layout: { yaxis } } = known(plot);
-    pen.font = '12px "Open Sans", verdana, arial, sans-serif';
-    const wide = (text) => pen.measureText(text).width + 8;
-    const labels = yaxis.ticktext.flatMap((text) => text.split("<br>"));
-    const inner = (light ? SHEET : plot.clientWidth) - 24 - Math.max(...labels.map(wide));
-    const most = Math.max(...bars.x.map(Math.abs)) || 1;
-    const ends = (scale) => {
-      const reached = bars.text.map((text, i) => bars.x[i] * scale + (bars.x[i] < 0 ? -1 : 1) * wide(text));
-      return [Math.min(0, ...reached), Math.max(0, ...reached)];
-    };
-    let low = 0.1 * Math.max(inner, 1) / most, high = 10 * low; // pixels for a unit
-    for (let i = 0; i < 30; i++) {
-      const scale = (low + high) / 2, [left, right] = ends(scale);
-      if (right - left > inner) high = scale; else low = scale;
-    }
-    return { ...axis, range: ends(low).map((end) => end / low) };
   };
   const config = {
     displaylogo: false, responsive: true, doubleClick: "reset",
@@ -95,8 +74,7 @@
   const draw = (plot) => {
     const first = !plot.drawn;
     plot.drawn = true;
-    const bars = known(plot).kind === "bars";
-    Plotly.react(plot, ...looks(plot), bars ? { ...config, displayModeBar: false, staticPlot: true } : config);
+    Plotly.react(plot, ...looks(plot), config);
     if (!first) return;
     const { kind } = panels[plot.dataset.panel];
     const placed = () => {
@@ -152,7 +130,7 @@
       ArrowLeft: [low - span / 5, high - span / 5], ArrowRight: [low + span / 5, high + span / 5],
       0: known(plot).home,
     }[event.key];
-    if (!to || panels[plot.dataset.panel].kind === "bars") return;
+    if (!to) return;
     event.preventDefault();
     Plotly.relayout(plot, { "xaxis.range": [...to] });
   };
@@ -305,10 +283,6 @@
       plot.layout.width = plot.layout.height = undefined;
       draw(plot);
     }
-  });
-  addEventListener("resize", () => {
-    if (light) return;
-    for (const plot of plots) if (plot.drawn && known(plot).kind === "bars") draw(plot);
   });
   night.addEventListener("change", () => { for (const plot of plots) if (plot.drawn) draw(plot); });
 
