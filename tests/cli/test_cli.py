@@ -3,9 +3,6 @@
 import csv
 import json
 import re
-import shutil
-import subprocess
-import sys
 import tomllib
 from importlib.util import find_spec
 from pathlib import Path
@@ -58,17 +55,6 @@ def test_the_list_of_commands_is_in_the_order_of_use():
     assert listed == COMMANDS and done.code == 0
     assert grounded("-h").out == done.out
     assert re.search("grounded demo +car-figure8", done.out)
-
-
-def test_help_needs_no_numpy():
-    code = (
-        "import sys, atexit\nsys.argv = ['grounded', '--help']\n"
-        "from grounded_cli.main import main\n"
-        "atexit.register(lambda: print([m for m in ('numpy', 'scipy', 'llvmlite', 'mcap') "
-        "if m in sys.modules], file=sys.stderr))\nmain()\n"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stderr.strip() == "[]"
 
 
 def test_a_code_is_explained():
@@ -135,10 +121,6 @@ def test_a_folder_that_is_no_workspace_is_exit_1(name, tmp_path):
     assert done.code == 1 and not done.out
     assert done.err.startswith("error: ") and holds(done.err, tmp_path)
     assert done.err.endswith("\nnext: grounded init DIR --example car-turn\n")
-
-
-def test_dash_c_works_before_and_after_the_command(w):
-    assert grounded("-C", w, "status").out == grounded("status", "-C", w).out
 
 
 def test_colour_only_on_a_terminal(w):
@@ -379,14 +361,6 @@ def test_a_workspace_without_trials_has_a_report_and_no_diagnosis(tmp_path):
     for command in ("diagnose", "fit"):
         done = grounded("-C", folder, command)
         assert done.code == 1 and holds(done.err, "ingest", "--data")
-
-
-def test_reports_may_be_deleted(learnt):
-    shutil.rmtree(learnt / "reports")
-    first = grounded("-C", learnt, "report", "--html", "--json").json
-    shutil.rmtree(learnt / "reports")
-    assert grounded("-C", learnt, "report", "--html", "--json").json == first
-    assert grounded("-C", learnt, "status").code == 0
 
 
 def test_fit_then_learn_reaches_as_far(learnt):

@@ -66,20 +66,6 @@ def test_files_that_are_no_log(w, tmp_path):
             refused(w, "ingest", tmp_path / name, *how, holds=[name])
 
 
-def test_cut_and_flipped_trials(w, trial, tmp_path):
-    data = trial.read_bytes()
-    damaged = [data[: int(part * len(data))] for part in (0.999, 0.7, 0.3, 0.01)]
-    rng = np.random.default_rng(0)
-    for _ in range(10):
-        bad = bytearray(data)
-        bad[rng.integers(len(data))] ^= 1 << rng.integers(8)
-        damaged.append(bytes(bad))
-    for content in (*damaged, data + b"garbage"):
-        (tmp_path / "bad.mcap").write_bytes(content)
-        refused(w, "ingest", tmp_path / "bad.mcap", holds=["bad.mcap"])
-    assert grounded("-C", w, "ingest", trial).code == 0  # the good one still is
-
-
 def test_a_trial_of_another_robot_clock_task_or_workspace(w, trial, tmp_path):
     refused(w, "ingest", w / "candidates" / "c0001.mcap", holds=["c0001.mcap", "candidate"])
     refused(w, "ingest", trial, "--candidate", "c0002", holds=["c0002"])

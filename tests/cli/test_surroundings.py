@@ -74,6 +74,7 @@ def test_commands_and_their_options():
             [],
             {"COMP_WORDS": "grounded re", "COMP_CWORD": "1", "_GROUNDED_COMPLETE": "bash_complete"},
         ),
+        (["--help"], {}),
         (["status", "--help"], {}),
         (["fit", "--jobs", "0"], {}),
     ],
@@ -88,7 +89,7 @@ try:
     main()
 except SystemExit:
     pass
-heavy = {{"numpy", "rerun", "mcap", "grounded_trials.door"}} & set(sys.modules)
+heavy = {{"numpy", "scipy", "llvmlite", "rerun", "mcap", "grounded_trials.door"}} & set(sys.modules)
 sys.exit(str(heavy) if heavy else 0)
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)

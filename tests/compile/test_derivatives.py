@@ -17,7 +17,7 @@ from grounded.model import Model, Param
 from grounded.models import aircraft, car, pendulum
 from grounded.search.first_guess import first_guess
 from grounded.solve import ddp
-from problems import SPECS, system
+from problems import system
 from small_tasks import plain_task
 from stepped import slopes
 
@@ -132,18 +132,6 @@ def test_compiled_agrees_with_interpreted(left, right, seed, eps):
         strict=True,
     ):
         assert np.allclose(mine, theirs, rtol=1e-10, atol=1e-10)
-
-
-@pytest.mark.parametrize("name", sorted(SPECS))
-def test_models_against_central_differences(name):
-    made, p = system(name)
-    rng = np.random.default_rng(1)
-    x, u = rng.normal(size=(20, made.n)) * 0.4, rng.uniform(0.3, 0.9, size=(20, made.m))
-    exact = made.sensitivities(x, u, p, 0.05, 0.1)
-    for found, near in zip(
-        exact, by_all(lambda *at: made.step(*at, 0.05, 0.1), x, u, p), strict=True
-    ):
-        assert np.allclose(found, near, atol=1e-6 * (1 + np.abs(near).max()))
 
 
 def test_a_branch_not_taken_never_leaks_nan():

@@ -276,24 +276,3 @@ def test_mismatch_is_an_error_with_both_values():
     system, (x, u, p) = make(forgetful), points()
     with pytest.raises(GroundedError, match=r"test_tracing.py:\d+.*'x' .*\d.*\d"):
         system.check(x, u, p, 0.1)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (lambda s: {"x": s.v}, "missing: v"),
-        (lambda s: {"x": s.v, "v": s.x, "w": 0.0}, "no state 'w'"),
-        (lambda s: {"x": s.v * 1j, "v": s.x}, "complex"),
-        (lambda s: {"x": 1j, "v": s.x}, "complex"),
-        (lambda s: {"x": np.array([s.v, s.x]), "v": s.x}, "shape"),
-        (lambda s: {"x": s.vel, "v": s.x}, "no state 'vel'"),
-        (lambda s: (s.x, s.v), "must return a dict"),
-    ],
-)
-def test_bad_models_are_errors_naming_file_and_line(values, message):
-    def model(s, a, p):
-        return values(s)
-
-    with pytest.raises(GroundedError, match=message) as caught:
-        make(model).step(*points()[:2], np.array([0.7]), 0.1)
-    assert "test_tracing.py:" in str(caught.value)

@@ -290,14 +290,3 @@ def test_half_the_step_leaves_a_quarter_of_the_error(name):
     )
     coarse, fine = (np.abs(one - true).max() for one in (coarse, fine))
     assert fine < coarse / 3 and coarse < 2e-3
-
-
-@pytest.mark.parametrize("name", RATES)
-def test_the_diagnosis_and_the_adopted_model_make_the_same_step(name):
-    one, data = of_boat(name, 0.1)
-    h, predictor = Hypothesis().plus(one, RATES[name]), Predictor(data)
-    x, u = data.y[:-1], predictor.inputs(h)
-    diagnosed = predictor.advance(h, x, u, data.time)
-    model = wrap(one, RATES[name], data.dt)
-    found = model.system.step(*predictor.flat(x, u), model.values, data.dt)
-    np.testing.assert_allclose(found.reshape(x.shape), diagnosed, atol=1e-12)

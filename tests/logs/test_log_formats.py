@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +21,7 @@ from grounded_trials.formats.tables import npz_tables
 from grounded_trials.logs.inspection.inspect_log import inspect_log
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.signals import SignalSpec, read_signals
+from ulog import ulog
 from workspaces import make
 
 N, DT, EPOCH = 300, 0.02, 1_700_000_000_000_000_000
@@ -94,18 +94,9 @@ def parquet(folder):
     return path
 
 
-def ulog(folder):
-    def message(kind, body):
-        return struct.pack("<HB", len(body), ord(kind)) + body
-
-    path = folder.with_suffix(".ulg")
-    head = b"ULog\x01\x12\x35\x01" + struct.pack("<Q", 0)
-    flags, layout = message("B", bytes(40)), b"gyro:uint64_t timestamp;float[3] rate;"
-    parts = [head, flags, message("F", layout), message("A", struct.pack("<BH", 0, 7) + b"gyro")]
-    for t, x in zip((STAMPS // 1000).tolist(), X.tolist(), strict=True):
-        parts.append(message("D", struct.pack("<HQfff", 7, t, 0.0, 0.0, x)))
-    path.write_bytes(b"".join(parts))
-    return path
+def px4(folder):
+    topics = {"gyro": (STAMPS // 1000, {"rate": np.column_stack([0 * X, 0 * X, X])})}
+    return ulog(folder.with_suffix(".ulg"), topics)
 
 
 FILE, MESSAGE, MCAP = CompressionMode.FILE, CompressionMode.MESSAGE, StoragePlugin.MCAP
@@ -123,7 +114,7 @@ LOGS = {
     "csv with semicolons": (lambda f: table(f, ";"), "/csv.rate"),
     "npz": (npz, "/npz.rate"),
     "parquet": (parquet, "/parquet.rate[1]"),
-    "px4": (ulog, "/gyro.rate[2]"),
+    "px4": (px4, "/gyro.rate[2]"),
 }
 
 

@@ -136,29 +136,6 @@ def test_a_turn_more_changes_nothing():
         np.testing.assert_allclose(one, other_, atol=1e-9)
 
 
-def test_after_the_horizon_the_held_input_is_sent():
-    p = policy()
-    run = Runner(p)
-    assert not run.done(0.9) and not run.done(0.98) and run.done(1.0)
-    assert not np.array_equal(run.action(0.98, np.zeros(2)), p.past)
-    for t in (0.995, 1.0, 5.0, 1e9):
-        np.testing.assert_array_equal(run.action(t, np.zeros(2)), p.past)
-
-
-def test_an_action_can_be_kept_and_changed_by_the_caller():
-    p = policy()
-    a, b = Runner(p), Runner(p)
-    s = np.zeros(2)
-    first = np.array(a.action(0.0, s))
-    got = b.action(0.0, s)
-    got *= 0.0
-    np.testing.assert_array_equal(a.action(0.1, s), b.action(0.1, s))
-    assert np.abs(first).max() > 0
-    after = b.action(9.0, s)
-    after *= 0.5
-    np.testing.assert_array_equal(b.action(9.0, s), p.past)
-
-
 def saved(folder, p, **about):
     path = folder / "c.npz"
     np.savez(path, **to_arrays(p, task="feed", **about))
@@ -315,10 +292,6 @@ def exported(tmp_path):
     return path
 
 
-def test_a_loaded_policy_has_the_horizon_that_the_docs_use(exported):
-    assert onboard.load(exported).policy.horizon == short().horizon == H
-
-
 def test_the_file_is_valid_python_3_8():
     source = Path(onboard.__file__).read_text(encoding="utf-8")
     tree = ast.parse(source, feature_version=(3, 8))
@@ -380,25 +353,6 @@ def test_what_is_held_after_the_end_is_inside_the_limits():
     for t in (0.5, 1e300, np.inf):
         assert runner.done(t) and runner.action(t, [0, 0]) == pytest.approx([0.45])
     assert Runner(short()).action(np.nan, [0, 0]) == pytest.approx([0.45])
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"high": np.array([np.inf])}, "limits"),
-        ({"low": np.array([np.inf]), "high": np.array([np.inf])}, "limits"),
-        ({"feedforward": np.ones((H, 1)) * 1j}, "feedforward.*complex"),
-        ({"depths": np.array([10**9])}, "depths"),
-        ({"state_names": np.array(["x"] * 2000)}, "state_names.*2000"),
-        ({"format": "other"}, "not a candidate"),
-    ],
-    ids=str,
-)
-def test_a_file_that_is_none_is_refused(change, message, tmp_path):
-    path = tmp_path / "bad.npz"
-    np.savez(path, **to_arrays(short()) | change)
-    with pytest.raises(ValueError, match=message):
-        onboard.load(path)
 
 
 @pytest.mark.slow

@@ -15,11 +15,9 @@ import pytest
 from cli import grounded, plain
 from facts import holds
 from grounded.errors import GroundedError, needs
-from grounded.figures.figure import Figure
 from grounded_cli import report
 from grounded_trials import Workspace
 from grounded_trials.logs.signals import SignalSpec, read_signals
-from grounded_trials.report.figures.png import png
 from grounded_trials.report.gathering import gather
 from grounded_trials.report.tables import parameter_table
 from grounded_trials.workspace.folder import Folder
@@ -366,12 +364,6 @@ def test_nothing_is_written_where_an_extra_is_missing(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     done = grounded("-C", tmp_path / "w", "report", "--html", "--png")
     assert done.code == 1 and not (tmp_path / "w" / "reports" / "report.html").exists()
-
-
-def test_a_picture_names_the_extra_that_it_needs(monkeypatch):
-    monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(GroundedError, match=r"\.\[png\]"):
-        png(Figure("utility", "Utility", "", ()))
 
 
 def test_what_is_there_is_imported():

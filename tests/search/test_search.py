@@ -285,14 +285,6 @@ def test_a_start_away_from_s0_does_not_stop_the_search(off=0.3, repeats=1, least
     assert TASK.utility(drive(TASK, PLANT, now.incumbent.candidate)) > least
 
 
-def test_a_search_with_nothing_to_gain_ends_before_a_trial_is_spent():
-    story = Story(plant=Plant(TASK.model), tolerance=0.01).add()
-    last = story.propose()
-    assert last.candidate is None and last.standing.phase == "converged"
-    assert last.standing.incumbent is not None
-    assert last.standing.incumbent.candidate.id == "c0001"
-
-
 def test_another_model_starts_again_with_the_first_step_from_the_best_policy():
     story = Story(step="full").add().add(bad).add(bad)
     assert story.candidates[-1].alpha == 0.5

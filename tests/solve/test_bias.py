@@ -172,17 +172,6 @@ def trial():
     return task, policy, real_plant().run(policy, start, np.random.default_rng(0))
 
 
-@pytest.mark.parametrize("exact", [True, False])
-def test_the_model_with_matched_inputs_replays_the_trial(trial, exact):
-    task, policy, run = trial
-    grounding = ground(task, run, exact=exact, match_inputs=True)
-    problem = grounding.on(task.problem(exact=exact))
-    assert np.abs(grounding.shift).max() > 0.01
-    swarm = problem.system.rollout(problem, policy.feedforward, policy.gain, policy.reference)
-    np.testing.assert_allclose(swarm.z[0][:, : car_model.n], run.states, atol=1e-9)
-    np.testing.assert_allclose(swarm.u[0], run.inputs, atol=1e-9)
-
-
 def test_matched_inputs_leave_less_to_the_bias(trial):
     task, _, run = trial
     plain = ground(task, run, exact=True).bias
@@ -254,28 +243,11 @@ def test_a_rollout_is_the_runner_in_the_model(delay):
     np.testing.assert_allclose(run.states[-1], x, atol=1e-10)
 
 
-def test_inputs_stay_inside_the_limits():
-    task = rover_task(low=np.array([-0.1, -0.2]), high=np.array([0.1, 0.2]), past=np.zeros(2))
-    run = simulate(task.problem(), feedback_policy(task))
-    assert (run.inputs >= task.low).all() and (run.inputs <= task.high).all()
-
-
 def test_a_run_that_diverges_is_minus_infinity_and_no_exception():
     task = cart_task()
     problem = task.problem(np.full((40, 2), 1e308))
     run = simulate(problem, task.policy(np.zeros((40, 1)), None, None))
     assert run.utility == -np.inf
-
-
-def test_the_inputs_already_sent_stand_beside_the_states():
-    task = rover_task(latency=np.array([0.0, 0.15]))
-    problem = task.problem()
-    u = np.arange(8.0).reshape(4, 2)
-    z = augmented(problem, np.zeros((5, 3)), u, np.array([-1.0, -2.0]))
-    np.testing.assert_array_equal(z[:, 3], [-1, 0, 2, 4, 6])
-    np.testing.assert_array_equal(
-        z[:, 4:], [[-2, -2, -2], [1, -2, -2], [3, 1, -2], [5, 3, 1], [7, 5, 3]]
-    )
 
 
 def test_smoothing_never_reaches_the_exact_model():

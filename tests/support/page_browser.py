@@ -120,12 +120,6 @@ class Browser:
             self.devtools("Input.dispatchKeyEvent", {"type": kind, **typed})
         time.sleep(0.3)
 
-    def tab(self) -> None:
-        """Press Tab."""
-        typed = {"key": "Tab", "code": "Tab", "windowsVirtualKeyCode": 9}
-        for kind in ("rawKeyDown", "keyUp"):
-            self.devtools("Input.dispatchKeyEvent", {"type": kind, **typed})
-
     def draw_all(self) -> None:
         """Scroll through the page and back, so that every panel is drawn."""
         self.run("document.querySelectorAll('details').forEach(d => { d.open = true; })")

@@ -215,13 +215,6 @@ def test_the_settings_are_as_before_if_the_target_can_t_be_written(w):
     assert files(w) == before
 
 
-def test_the_old_target_is_kept(w):
-    old = (w.folder / "target.csv").read_bytes()
-    path = w.target({"theta": list(LINE)})
-    assert (w.folder / "target.csv.bak").read_bytes() == old != path.read_bytes()
-    assert w.config.task.horizon == 20
-
-
 PLATE = """from grounded import Model
 model = Model(states={"T": "degC", "x": "m"}, inputs={"heater": "%"}, params={},
     derivative=lambda s, a, p: {"T": 0.01 * a.heater - 0.01 * (s.T - 20), "x": 0.01 * a.heater})

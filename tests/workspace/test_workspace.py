@@ -11,7 +11,7 @@ from cli import grounded
 from cli import plain as said
 from facts import holding, holds
 from grounded.diagnosis.diagnose import diagnose
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import GroundedError
 from grounded.fit import fit
 from grounded.result import Result, plain
 from grounded.trial import Trial
@@ -89,18 +89,6 @@ def test_times_may_be_rounded_to_a_hundredth_of_a_step(tmp_path):
     (tmp_path / "u.csv").write_text("t,x\n0,0\n0.05,0\n0.08,0\n0.1,0\n")  # uneven
     with pytest.raises(GroundedError, match="line 3"):
         target_arrays(tmp_path / "u.csv", ["x"], ["u"], 1 / 30, 3)
-
-
-def test_a_copied_workspace_is_the_same_workspace(tmp_path):
-    w = make(tmp_path / "w")
-    grounded("-C", w.folder, "learn", "--trials", "2")
-    shutil.copytree(w.folder, tmp_path / "copy")
-    a, b = (grounded("-C", f, "status", "--json").json for f in (w.folder, tmp_path / "copy"))
-    assert a == b
-    a, b = (grounded("-C", f, "propose", "--json").json for f in (w.folder, tmp_path / "copy"))
-    assert {k: v for k, v in a.items() if k != "file"} == {
-        k: v for k, v in b.items() if k != "file"
-    }
 
 
 def test_comments_and_layout_of_grounded_toml_survive_fit_apply(tmp_path):
@@ -253,23 +241,6 @@ def test_a_name_that_is_not_there():
 
     with pytest.raises(AttributeError, match="Workshop"):
         _ = grounded_trials.Workshop
-
-
-def test_a_session_from_an_example_to_a_report(tmp_path):
-    w = Workspace.create(tmp_path / "w", example="pendulum")
-    first = w.propose()
-    assert first.then == NextCommand("run") and first.candidate.id == "c0001"
-    ran = w.run()
-    assert ran.then == NextCommand("ingest", (str(ran.trial_file),)) == w.status().then
-    found = w.ingest(ran.trial_file)
-    assert (found.trial, found.verdict, found.then) == ("t0001", "first", NextCommand("propose"))
-    seen = []
-    status = w.learn(1, each=lambda candidate, trial: seen.append((candidate.id, trial.trial)))
-    assert seen == [("c0002", "t0002")] and status.standing.trials == 2
-    report = w.report(html=True)
-    assert [path.name for path in report.paths] == ["report.html"]
-    assert not report.findings.lost
-    assert w.verify().damaged == ()
 
 
 def test_the_condition_of_a_run_is_named_and_named_anew(tmp_path):

@@ -1,7 +1,5 @@
 """ingest: our own trials byte for byte, others through [log], each content once."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -136,31 +134,6 @@ def test_a_run_of_another_task_is_kept_as_data_and_old_trials_are_ignored(w):
     assert (made.id, made.base) == ("c0002", "")
     w.config.file.write_text(config)
     assert standing_in(type(w)(w.folder)).trials == 1  # and back again
-
-
-def test_a_recovered_trial_of_a_dead_robot_is_a_failed_candidate(w, tmp_path):
-    """The battery died: the file has no end. recover saves it, ingest takes it as a short run."""
-    propose_in(w)
-    path = tmp_path / "live.mcap"
-    code = (
-        "import os, numpy as np\nfrom grounded_trials.store.trial_file import TrialWriter\n"
-        f"w = TrialWriter({str(path)!r}, 0.05, {{'x': 'm', 'v': 'm/s'}}, {{'force': 'N'}}, {{}}, "
-        "candidate='c0001')\n"
-        "for k in range(30):\n    w.append(0.05 * k, np.zeros(2), np.zeros(1))\n"
-        "os._exit(9)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=False)
-    refused = grounded("-C", w.folder, "ingest", path)
-    assert refused.code == 1 and "grounded recover" in refused.err
-    saved = grounded("recover", path, "-o", tmp_path / "saved.mcap", "--json")
-    assert saved.code == 3 and saved.json["messages"]["/state"] >= 20
-    done = grounded(
-        "-C", w.folder, "ingest", tmp_path / "saved.mcap", "--candidate", "c0001", "--json"
-    )
-    assert done.code == 0, done.err
-    (trial,) = done.json["trials"]
-    assert trial["failed"] and trial["candidate"] == "c0001"
-    assert "run.failed" in [one["code"] for one in trial["findings"]]
 
 
 def test_gaps_are_stored_as_they_are_and_bridged_when_read(w, tmp_path):
