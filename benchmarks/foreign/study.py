@@ -71,7 +71,7 @@ def measured(setup: Setup, after: int = 0) -> Row:
                 own = {name: one.value for name, one in values.items() if name in params}
                 named = [n for n in found.effects if not n.startswith("parameter:")]
                 fitted = task.with_model(task.model.with_values(own))
-                planner = planner_of(fitted, [{"name": n, **found.values(n)} for n in named])
+                planner = planner_of(fitted, {name: found.values(name) for name in named})
                 planner, place = replace(planner, task=task), place_of(setup.cause, found)
                 claimed = " + ".join([*named, *own]) or "nothing"
                 continue

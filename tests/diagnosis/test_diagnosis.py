@@ -262,7 +262,7 @@ def test_a_correction_is_adopted_as_part_of_the_model(workspace_of, asked):
     names = [effect["name"] for effect in done.effects]
     assert names == ["correction:v<-x", "correction:v<-force"] and done.claimed
     again = Workspace(workspace.folder)
-    assert [e["w6"] for e in again.config.model.effects] == [pytest.approx(0.6)] * 2
+    assert [e["w6"] for e in again.config.model.effects.values()] == [pytest.approx(0.6)] * 2
     assert again.propose().candidate
 
 

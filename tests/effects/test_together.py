@@ -69,7 +69,7 @@ def arriving(plan):
 
 
 def planned(parts):
-    return planner_of(task(), [{"name": name, **values} for name, values in parts])
+    return planner_of(task(), dict(parts))
 
 
 def adopted(parts):
@@ -107,12 +107,11 @@ def test_what_is_late_by_a_part_of_a_step_is_bent_before_and_after_it_arrives(pa
 
 
 def test_a_gain_of_a_rate_takes_along_what_was_adopted_on_that_rate():
-    old = [{"name": PULL[0], **PULL[1]}, {"name": "viscous_friction:v", "k": 0.1}]
+    old = dict([PULL, ("viscous_friction:v", {"k": 0.1})])
     model = planner_of(task(), old).plan.model
     want = predicted((("rate_gain:delta", {"g": 0.3}),), model)
-    found = in_order(old, [{"name": "rate_gain:delta", "g": 0.3}])
-    parts = [(e["name"], {k: v for k, v in e.items() if k != "name"}) for e in found]
-    by_name = dict(parts)
+    by_name = in_order(old, {"rate_gain:delta": {"g": 0.3}})
+    parts = [*by_name.items()]
     beside = adopted([(PULL[0], PULL[1]), *parts[1:]])
     off, before = (np.abs(one - want).max() for one in (adopted(parts), beside))
     assert off < 5e-3 < before / 4  # half a step's kick of the one or the other

@@ -259,7 +259,7 @@ def _logged(task, drag):
 
 def test_a_late_log_is_not_taken_for_what_the_model_lacks():
     task = cart_task()
-    planner = planner_of(task, [{"name": "sensor_delay:x", "d": DELAY * task.dt}])
+    planner = planner_of(task, {"sensor_delay:x": {"d": DELAY * task.dt}})
     right, wrong = _logged(task, 0.2), _logged(task, 0.6)
     assert np.abs(residuals(planner.plan, anchored(planner, right))[:, 0]).max() < 1e-9
     free = residuals(planner.plan, planner.lift(wrong))[:, 0]
@@ -276,17 +276,14 @@ def _rms(planner, trial):
 
 def test_a_forecast_starts_where_a_late_and_filtered_log_says_that_the_robot_was():
     task = cart_task()
-    effects = [
-        {"name": "sensor_delay:x", "d": DELAY * task.dt},
-        {"name": "sensor_lag:v", "tau": 0.1},
-    ]
+    effects = {"sensor_delay:x": {"d": DELAY * task.dt}, "sensor_lag:v": {"tau": 0.1}}
     right = _logged(task, 0.2)
     v, a = [0.0], np.exp(-task.dt / 0.1)
     for mean in (right.states[1:, 1] + right.states[:-1, 1]) / 2:
         v.append(a * v[-1] + (1 - a) * mean)
     late = replace(right, states=np.column_stack([right.states[:, 0], v]))
     noisy = replace(late, states=late.states + 1e-3 * np.random.default_rng(0).normal(size=(41, 2)))
-    knows, plain = (_rms(planner_of(task, some), noisy) for some in (effects, []))
+    knows, plain = (_rms(planner_of(task, some), noisy) for some in (effects, {}))
     assert (knows < 0.5 * plain).all() and (knows < 0.02).all()
 
 

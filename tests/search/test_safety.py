@@ -284,7 +284,7 @@ def story():
 
 def test_a_start_behind_a_late_sensor_costs_as_much(story):
     policy = story.candidates[1].policy
-    late = planner_of(TASK, [{"name": "sensor_delay:x", "d": 1.5 * TASK.dt}])
+    late = planner_of(TASK, {"sensor_delay:x": {"d": 1.5 * TASK.dt}})
     assert late.plan.model.n > TASK.model.n
     plain, behind = (worth_of_start(planner, policy, OFF) for planner in (PLANNER, late))
     assert behind == pytest.approx(plain, rel=0.3) and behind < 0

@@ -366,7 +366,7 @@ def lagging():
     )
     target, ends = np.tile([1.0, 0.0], (81, 1)), [100.0, 1.0]
     task = plain_task(model, 0.02, target, [10.0, 0.0], 20.0, terminal=ends, effort=1e-4)
-    return planner_of(task, [{"name": "first_order_lag:moment", "tau": 0.08}])
+    return planner_of(task, {"first_order_lag:moment": {"tau": 0.08}})
 
 
 def disturbed(problem, run, K):

@@ -399,7 +399,7 @@ def test_an_adopted_delay_is_fitted_with_the_parameters_or_named_as_taken_for_ex
     assert found["start"] == late["d"]
     assert set(w.fit(["mass"]).to_json()["params"]) == {"mass"}
     apply_fit(w, w.fit().fit)
-    (effect,) = Workspace(w.folder).config.model.effects
+    (effect,) = Workspace(w.folder).config.model.effects.values()
     assert effect["d"] == pytest.approx(found["value"], rel=1e-6)
     # times are known to the rows of the logs, and to what was interpolated between them
     exact = w.fit().to_json()["params"]["delay_force_d"]

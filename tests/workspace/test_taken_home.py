@@ -330,7 +330,7 @@ def test_another_workspace_begins_with_an_actuator_and_its_spread(tmp_path):
     args = ("init", tmp_path / "n", "--blank", "--model", w / "model.py", "--actuators", file)
     assert grounded(*args).code == 0
     new = Workspace(tmp_path / "n")
-    effects = {str(e["name"]): e for e in new.config.model.effects}
+    effects = new.config.model.effects
     assert effects["joint_friction:force<-v"]["c"] == pytest.approx(0.6)
     assert effects["delay:force"]["d"] == pytest.approx(0.04)
     params = new.planner.plan.model.params

@@ -100,8 +100,8 @@ def test_adopting_a_change_of_a_delay_replaces_it():
     made = Made(adopted=({"name": "delay:u", "d": 0.104},))
     row = Ranked("delay:u", {"d": Estimate(-0.004)}, claimed=True)
     found = Diagnosis(Verdict("effect", ("delay:u",)), ranking=(row,), made=made)
-    _, effects = joined(found, ["delay:u"], made.adopted, {}, {})
-    assert effects == [{"name": "delay:u", "d": 0.1}]
+    _, effects = joined(found, ["delay:u"], {"delay:u": {"d": 0.104}}, {}, {})
+    assert effects == {"delay:u": {"d": 0.1}}
 
 
 LAG = 0.12

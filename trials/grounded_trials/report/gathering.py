@@ -65,7 +65,7 @@ def gather(workspace: Folder) -> Findings:
         name=workspace.folder.resolve().name,
         task=task,
         nominal={name: p.value for name, p in workspace.origin.model.params.items()},
-        effects=tuple(str(e["name"]) for e in workspace.config.model.effects),
+        effects=tuple(workspace.config.model.effects),
         method=_method(workspace),
         standing=now,
         runs=tuple(_runs(task, now, own, better, lost)),

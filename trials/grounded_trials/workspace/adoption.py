@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -22,7 +23,8 @@ from grounded.diagnosis.parts import Diagnosis, Estimate
 from grounded.effects import param_name
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, found, settle
-from grounded.result import UNSAID, Document, listed, number
+from grounded.result import UNSAID, Document, number
+from grounded.result import listed as joined_names
 from grounded.search.planner import Planner
 from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
@@ -34,15 +36,19 @@ from grounded_trials.workspace.last_diagnosis import (
 )
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.readings import taken_out, twice_in_time
-from grounded_trials.workspace.user_files.config import ModelTable, as_toml, set_keys
+from grounded_trials.workspace.user_files.config import (
+    Effects,
+    ModelTable,
+    as_toml,
+    listed,
+    set_keys,
+)
 
 AGAIN, PROPOSE = NextCommand("diagnose"), NextCommand("propose")
 KEPT = "adoptions.json"  # in reports/
 NEGLIGIBLE_STEP = 0.1  # fraction of a control step: shorter filters and delays make no difference
 NO_CHANGE = 1e-3  # relative change of a parameter that counts as none
 WRITTEN = 1e-6  # relative difference of a value and what is written of it
-
-Effects = Sequence[Mapping[str, Any]]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -61,18 +67,13 @@ class Adopted(Document):
 
     def summary(self) -> str:
         """Return the effects that the model has now."""
-        return ", ".join(_names(self.effects))
+        return ", ".join(str(effect["name"]) for effect in self.effects)
 
 
-def _names(effects: Effects) -> list[str]:
-    return [str(effect["name"]) for effect in effects]
-
-
-def _numbers(effects: Iterable[Mapping[str, Any]]) -> Iterator[tuple[str, str, str, float]]:
+def _numbers(effects: Effects) -> Iterator[tuple[str, str, str, float]]:
     """Yield effect, quantity, name as a parameter and value of each number of some effects."""
-    for effect in effects:
-        name = str(effect["name"])
-        yield from ((name, q, param_name(name, q), v) for q, v in effect.items() if q != "name")
+    for name, values in effects.items():
+        yield from ((name, q, param_name(name, q), value) for q, value in values.items())
 
 
 # what a diagnosis offers
@@ -83,7 +84,7 @@ def late_open(workspace: Folder, diagnosis: Diagnosis) -> tuple[str, ...]:
     task, late = workspace.config.task, diagnosis.late_sensors
     if not (late and task.target and task.feedback):
         return ()
-    known, gone = _names(workspace.config.model.effects), taken_out(workspace)
+    known, gone = workspace.config.model.effects, taken_out(workspace)
 
     def is_open(name: str, own: Mapping[str, float]) -> bool:
         in_log = max(gone.get(one, 0.0) for one in name.partition(":")[2].split("+"))
@@ -107,7 +108,10 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     # What is new, but what the user has undone; late sensors are adopted with it, or alone.
     table = workspace.config.model
-    new, undone = diagnosis.open(table.effects, table.params), {*_readable(workspace).undone}
+    new, undone = (
+        diagnosis.open(listed(table.effects), table.params),
+        {*_readable(workspace).undone},
+    )
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     alone = NextCommand("adopt", late) if late else None
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.doubt
@@ -128,10 +132,10 @@ def joined(
     effects: Effects,
     nominal: Mapping[str, float],
     calibrated: Mapping[str, Estimate],
-) -> tuple[dict[str, float], list[dict[str, Any]]]:
+) -> tuple[dict[str, float], Effects]:
     """Return the parameters to set and all effects, after adding diagnosed effects to a model."""
     before, fitted = diagnosis.made.effects, [*diagnosis.joining]
-    old, new = {str(effect["name"]): dict(effect) for effect in effects}, list[dict[str, Any]]()
+    old, new = {name: dict(values) for name, values in effects.items()}, dict[str, Any]()
     params = {name: _rounded(estimate.value) for name, estimate in calibrated.items()}
     last = len(fitted)
     for name in sorted(names, key=lambda n: fitted.index(n) if n in fitted else last):
@@ -142,9 +146,10 @@ def joined(
         elif name in before:  # a further delay adds to the adopted one, if that still is
             old.get(name, {})["d"] = _rounded(float(before[name]["d"]) + values["d"])
         else:
-            new.append({"name": name} | {q: _rounded(value) for q, value in values.items()})
-    own, both = settled(params, [*old.values(), *new])
-    return own, in_order(both[: len(old)], both[len(old) :])
+            new[name] = {q: _rounded(value) for q, value in values.items()}
+    own, settled_old = settled(params, old)
+    own, settled_new = settled(own, new)
+    return own, in_order(settled_old, settled_new)
 
 
 def _rounded(value: float) -> float:
@@ -196,8 +201,9 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
     planner_of(workspace.task, adopted)  # a model that can't be built from these effects
 
     # Write it, how it can be undone, and how sure the values are.
-    set_keys(file, "model", params=params if own else None, effects=adopted or None)
-    after = {"effects": adopted or _written(model)["effects"], "params": params}
+    every = listed(adopted)
+    set_keys(file, "model", params=params if own else None, effects=every or None)
+    after = {"effects": every, "params": params}
     step = Step(tuple(names), _written(model), after)
     now = own | {name: value for _, _, name, value in _numbers(adopted)}
     std = {name: e.std for name, e in calibrated.items()}
@@ -215,13 +221,13 @@ def adopt_effects(workspace: Folder, *effects: str, parameters: bool = True) -> 
         if name not in {*calibrated, *own} and (old := known.nominal.get(name)) is not None
         if abs(e.value - old) > NO_CHANGE * max(abs(old), e.std)
     }
-    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(known.effects.values())}
+    called = {name: f"{q} of {effect}" for effect, q, name, _ in _numbers(model.effects)}
     told = list[Finding]()
     for name, e in left.items():
         was, value = Quantity(nominal[name], e.unit), Quantity(e.value, e.unit)
         told.append(found("model.not_told", called.get(name, name), kept=was, value=value))
     return Adopted(
-        effects=tuple(adopted),
+        effects=tuple(every),
         params=own,
         claimed=claimed,
         jointly=(
@@ -261,7 +267,7 @@ def _claims_all(workspace: Folder, diagnosis: Diagnosis, names: Sequence[str]) -
         raise refused("gap.next.changed", then=newer_alone(diagnosis))
     before, own = diagnosis.made.effects, [*diagnosis.effects, *_curves(diagnosis)]
     known = {*(row.effect for row in diagnosis.ranking), *own, *diagnosis.late_sensors}
-    adopted = {*_names(workspace.config.model.effects)} - {*before}.intersection(known)
+    adopted = {*workspace.config.model.effects} - {*before}.intersection(known)
     for name in names:
         if name not in known | adopted:
             raise unknown("effect", name, known, "the last diagnosis")
@@ -284,12 +290,11 @@ def undo_adoption(workspace: Folder) -> Adopted:
     """
     known, file, model = kept(workspace), workspace.config.file, workspace.config.model
     if not known.adoptions:
-        has = ", ".join(_names(model.effects)) or "none"
-        raise refused("model.edited", file, effects=has)
+        raise refused("model.edited", file, effects=", ".join(model.effects) or "none")
     last = known.adoptions[-1]
     params, effects = last.before["params"], last.before["effects"]
     if _written(model) != last.after:
-        had = listed(f"{name} = {as_toml(v).as_string()}" for name, v in last.before.items())
+        had = joined_names(f"{name} = {as_toml(v).as_string()}" for name, v in last.before.items())
         raise refused("model.edited", file, adopted=last.names, had=had)
     set_keys(file, "model", params=params, effects=effects)
     keep(workspace, adoptions=known.adoptions[:-1], undone=(*known.undone, *last.names))
@@ -299,7 +304,7 @@ def undo_adoption(workspace: Folder) -> Adopted:
 
 def _written(model: ModelTable) -> dict[str, Any]:
     """Return the parts of [model] that an adoption may change, for JSON."""
-    return {"effects": [dict(e) for e in model.effects], "params": dict(model.params)}
+    return {"effects": listed(model.effects), "params": dict(model.params)}
 
 
 # what is kept of the model beside grounded.toml
@@ -355,35 +360,28 @@ def diagnosed_again(workspace: Folder) -> None:
 # the model as it is now
 
 
-def units_of(workspace: Folder, effect: str) -> dict[str, str]:
-    """Return the units of an effect's quantities, "" where they are not known.
-
-    That is so beside another adopted effect, and of a package that is not installed.
-    """
-    units = {q: "" for e in workspace.config.model.effects if e["name"] == effect for q in e}
-    units.pop("name", None)
-    try:
-        known = installed_effects().effect(effect, workspace.base_model).free
-    except GroundedError:
-        return units
-    return units | {q.name: q.unit for q in known}
-
-
 def numbers_in(workspace: Folder) -> dict[str, tuple[float, str]]:
     """Return the numbers of the adopted effects with their units, as they are called."""
-    numbers = _numbers(workspace.config.model.effects)
-    return {f"{q} of {e}": (v, units_of(workspace, e).get(q, "")) for e, q, _, v in numbers}
+    known = known_values(workspace)
+    return {
+        f"{q} of {effect}": (value, known[name].unit)
+        for effect, q, name, value in _numbers(workspace.config.model.effects)
+    }
 
 
 def known_values(workspace: Folder) -> dict[str, Estimate]:
     """Return the values of parameters and adopted effects, by parameter name, with their +-.
 
-    The +- is that of the adoption or the fit that wrote this value, else NaN.
+    The +- is that of the adoption or the fit that wrote this value, else NaN. Units are "" beside
+    another adopted effect, and of a package that is not installed.
     """
-    kept = _readable(workspace).values
-    now = {name: (one.value, one.unit) for name, one in workspace.base_model.params.items()}
+    kept, model = _readable(workspace).values, workspace.base_model
+    now = {name: (one.value, one.unit) for name, one in model.params.items()}
     for effect, q, name, value in _numbers(workspace.config.model.effects):
-        now[name] = float(value), units_of(workspace, effect)[q]
+        units = dict[str, str]()
+        with suppress(GroundedError):
+            units = {one.name: one.unit for one in installed_effects().effect(effect, model).free}
+        now[name] = value, units.get(q, "")
     found_values = dict[str, Estimate]()
     for name, (value, unit) in now.items():
         at, std = kept[name] if len(kept.get(name, ())) == 2 else (math.nan, math.nan)
@@ -404,7 +402,7 @@ def better_model(workspace: Folder, diagnosis: Diagnosis | None) -> Better | Non
     """Return the diagnosed model, else the one with adopted effects; None if there is neither."""
     table, task = workspace.config.model, workspace.task
     if diagnosis is not None:
-        new = diagnosis.open(table.effects, table.params)
+        new = diagnosis.open(listed(table.effects), table.params)
         names = [name for name in diagnosis.joining if name in new and diagnosis.ranked(name)]
         known = {n: e for n, e in diagnosis.adoptable.items() if math.isfinite(e.value)}
         nominal = _nominal(workspace, diagnosis)
@@ -423,10 +421,9 @@ def adopted_rows(workspace: Folder) -> tuple[tuple[str, str], ...]:
     """
     table, found = workspace.config.model, list[tuple[str, str]]()
     known = known_values(workspace) if table.effects or table.params else {}
-    for effect in table.effects:
-        name = str(effect["name"])
-        numbers = ((q, param_name(name, q)) for q in effect if q != "name")
-        found.append((name, ", ".join(f"{q} = {known[one].text}" for q, one in numbers)))
+    for name, values in table.effects.items():
+        numbers = (f"{q} = {known[param_name(name, q)].text}" for q in values)
+        found.append((name, ", ".join(numbers)))
     for name, param in workspace.origin.model.params.items() if table.params else ():
         if table.params.get(name, param.value) != param.value:
             found.append((name, f"{known[name].text}, was {number(param.value)}"))

@@ -42,6 +42,7 @@ from grounded_trials.workspace.next_step import (
     after_diagnosis,
 )
 from grounded_trials.workspace.readings import one_message
+from grounded_trials.workspace.user_files.config import listed
 from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
@@ -84,11 +85,8 @@ def diagnose_in(
         engine: workers that fit hypotheses; their number does not change the result.
         progress: called with each stage.
     """
-    effects = [dict(effect) for effect in workspace.config.model.effects]
-    names = [str(effect["name"]) for effect in effects]
-    delays = {
-        n: float(e["d"]) for n, e in zip(names, effects, strict=True) if n.startswith("delay:")
-    }
+    effects = workspace.config.model.effects
+    delays = {n: values["d"] for n, values in effects.items() if n.startswith("delay:")}
     library = (library or installed_effects()).without(without)
     planner = workspace.planner
     share = chosen(workspace, trials)
@@ -101,7 +99,7 @@ def diagnose_in(
         library=library,
         max_effects=max_effects,
         hidden=tuple(memory),
-        but={*names} - {*delays},  # the d of a delay is not a model parameter
+        but={*effects} - {*delays},  # the d of a delay is not a model parameter
         one_message=one_message(workspace),
         delays=delays,
         interpolated_s=early,
@@ -110,7 +108,7 @@ def diagnose_in(
     lifted, apart = ([planner.lift(trial) for trial in some] for some in (used, others))
     made = Made(
         trials=tuple(trial.id for trial in used + others),
-        adopted=tuple(effects),
+        adopted=tuple(listed(effects)),
         params=dict(workspace.config.model.params),
         nominal={name: p.value for name, p in planner.plan.model.params.items()},
         named=tuple(trial.id for trial in used) if trials or compare else (),

@@ -28,7 +28,7 @@ from grounded_trials.workspace.last_diagnosis import chosen, readable_diagnosis,
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.next_step import after_fit
 from grounded_trials.workspace.readings import one_message
-from grounded_trials.workspace.user_files.config import set_keys
+from grounded_trials.workspace.user_files.config import listed, set_keys
 from grounded_trials.workspace.where_to_mend import where_to_mend
 
 if TYPE_CHECKING:
@@ -166,20 +166,19 @@ def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:
     """
     plan, found = workspace.planner.plan, dict[str, tuple[int, ...]]()
     assert plan.latency is not None
-    for effect in workspace.config.model.effects:
-        family, _, target = str(effect["name"]).partition(":")
+    for effect, values in workspace.config.model.effects.items():
+        family, _, target = effect.partition(":")
         if family != "delay":
             continue
         inputs = tuple(plan.model.input_names.index(name) for name in target.split("+"))
-        if np.allclose(plan.latency[list(inputs)], effect["d"], rtol=0.0, atol=1e-9):
-            found[param_name(str(effect["name"]), "d")] = inputs
+        if np.allclose(plan.latency[list(inputs)], values["d"], rtol=0.0, atol=1e-9):
+            found[param_name(effect, "d")] = inputs
     return found
 
 
 def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
     """Return the adopted delays that were not fitted."""
-    names = (str(e["name"]) for e in workspace.config.model.effects)
-    delays = (name for name in names if name.startswith("delay:"))
+    delays = (name for name in workspace.config.model.effects if name.startswith("delay:"))
     return tuple(name for name in delays if param_name(name, "d") not in found.params)
 
 
@@ -208,12 +207,12 @@ def apply_fit(workspace: Folder, found: Fit) -> None:
         delays = zip(base.input_names, found.latency, strict=True)
         late = {name: round(float(d), 6) for name, d in delays}
         set_keys(workspace.config.file, "task", latency=late)
-        effects = [e for e in effects if not str(e["name"]).startswith("delay:")]
+        effects = {n: values for n, values in effects.items() if not n.startswith("delay:")}
     set_keys(
         workspace.config.file,
         "model",
         params=dict(table.params) | own,
-        effects=effects if table.effects else None,
+        effects=listed(effects) if table.effects else None,
     )
     known = {n: (value, std) for n, value in values.items() if (std := found.params[n].std) >= 0}
     keep(workspace, known)

@@ -25,6 +25,7 @@ from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import named_trials, sha256
+from grounded_trials.workspace.user_files.config import listed
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
@@ -168,11 +169,12 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others
-    missing = diagnosis.open(model.effects, model.params)
+    now = listed(model.effects)
+    missing = diagnosis.open(now, model.params)
     adopted = [name for name in diagnosis.effects if name not in missing]
     known = {*made.effects, *diagnosis.effects}
-    adopted += [name for e in model.effects if (name := str(e["name"])) not in known]
-    same = [*map(dict, model.effects)] == [*map(dict, made.adopted)]
+    adopted += [name for name in model.effects if name not in known]
+    same = now == [*map(dict, made.adopted)]
     same = same and made.params in (None, dict(model.params))
     return Since(
         used=sum(name in made.trials for name in usable),

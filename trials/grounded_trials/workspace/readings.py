@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from grounded.findings import Finding as Said
 from grounded.findings import found as said
@@ -19,6 +19,7 @@ from grounded_trials.workspace.identity import READ_BY
 if TYPE_CHECKING:
     from grounded_trials.logs.log_table import LogMapping
     from grounded_trials.workspace.folder import Folder
+    from grounded_trials.workspace.user_files.config import Effects
 
 
 @dataclass(frozen=True)
@@ -102,9 +103,7 @@ def taken_out(workspace: Folder) -> dict[str, float]:
     return {n: one.delay_s - before.get(n, UNCHANGED).delay_s for n, one in log.items()}
 
 
-def twice_in_time(
-    workspace: Folder, effects: Sequence[Mapping[str, Any]] | None = None
-) -> Said | None:
+def twice_in_time(workspace: Folder, effects: Effects | None = None) -> Said | None:
     """Return that [log] now removes delays that the model has as well.
 
     Args:
@@ -112,8 +111,8 @@ def twice_in_time(
         effects: the model's effects; None for those that are adopted.
     """
     effects = workspace.config.model.effects if effects is None else effects
-    named = {str(one["name"]): float(one.get("d", 0.0)) for one in effects}
-    late = {n.removeprefix(SENSOR_DELAY): d for n, d in named.items() if SENSOR_DELAY in n}
+    named = {n.removeprefix(SENSOR_DELAY): one for n, one in effects.items() if SENSOR_DELAY in n}
+    late = {n: one.get("d", 0.0) for n, one in named.items()}
     gone = taken_out(workspace) if late else {}
     twice = [name for name, d in late.items() if gone.get(name, 0.0) > d / 2 > 0]
     if not twice:

@@ -84,9 +84,8 @@ class Held:
         }
         found = {f"delay:{n}": {"d": Estimate(d, 0.0, unit="s")} for n, d in late.items() if d}
         pairs = [*found.items()]
-        for effect in workspace.config.model.effects:
-            name = str(effect["name"])
-            pairs.append((name, {q: values[param_name(name, q)] for q in effect if q != "name"}))
+        for name, its in workspace.config.model.effects.items():
+            pairs.append((name, {q: values[param_name(name, q)] for q in its}))
         return held, [(name, c) for name, c in pairs if not held.adopt(name, c)]
 
     def add(self, kind: str, index: int, field: str, by: float, std: float) -> None:

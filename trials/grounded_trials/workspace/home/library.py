@@ -17,7 +17,7 @@ from __future__ import annotations
 import datetime
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -39,11 +39,11 @@ from grounded.model import Model
 from grounded.result import Document
 from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.store import write_atomically
-from grounded_trials.workspace.adoption import known_values, units_of
+from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.home.held import Held
 from grounded_trials.workspace.last_diagnosis import usable_ids
-from grounded_trials.workspace.user_files.config import set_keys
+from grounded_trials.workspace.user_files.config import listed, set_keys
 
 # what each number of the file is: an effect of the input, its quantity
 KEYS = {
@@ -124,7 +124,7 @@ def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]
     Raises:
         GroundedError: if a file is no actuator, or no input takes its commands.
     """
-    model, effects, priors = workspace.base_model, dict[str, dict[str, Any]](), dict[str, float]()
+    model, effects, priors = workspace.base_model, dict[str, dict[str, float]](), dict[str, float]()
     driven = _driven(model)
     for text in actuators:
         file, _, names = text.rpartition(":") if not Path(text).is_file() else (text, "", "")
@@ -138,10 +138,10 @@ def begin_with(workspace: Folder, *actuators: str) -> tuple[dict[str, Any], ...]
             raise unknown("input", names, model.input_names)
         for name in inputs:
             _begin(path, table, name, driven.get(name, ""), effects, priors)
-    set_keys(workspace.config.file, "model", effects=[*effects.values()], priors=priors)
+    set_keys(workspace.config.file, "model", effects=listed(effects), priors=priors)
     workspace.forget()
     _ = workspace.planner  # raises if the model can't be built from them
-    return tuple(effects.values())
+    return tuple(listed(effects))
 
 
 def _begin(
@@ -149,7 +149,7 @@ def _begin(
     table: Mapping[str, Any],
     name: str,
     drives: str,
-    effects: dict[str, dict[str, Any]],
+    effects: dict[str, dict[str, float]],
     priors: dict[str, float],
 ) -> None:
     """Add the effects of one input by their names, and how sure their values are."""
@@ -163,7 +163,7 @@ def _begin(
         value, std = number_in(path, key, table[key])
         effect = f"{family}:{name}<-{drives}" if family in DRIVES else f"{family}:{name}"
         rubs = {"c": 0.0, "b": 0.0} if family.endswith("_friction") else {}
-        one = effects.setdefault(effect, {"name": effect, **rubs})
+        one = effects.setdefault(effect, rubs)
         one[q] = value - 1 if key == "gain" else value
         if math.isfinite(std) and std > 0 and family != "delay":
             priors[param_name(effect, q)] = std
@@ -182,20 +182,17 @@ def _found(workspace: Folder, name: str, drives: str) -> Iterator[tuple[str, Est
     if isinstance(model.step, MujocoStepper) and model.step.source is not None:
         found |= dict(_of_file(workspace, known, name, drives))
     by_unit = _gain(model, name, drives)
-    for effect in workspace.config.model.effects:
-        family, _, target = str(effect["name"]).partition(":")
-        units = units_of(workspace, str(effect["name"]))
+    for effect, values in workspace.config.model.effects.items():
+        family, _, target = effect.partition(":")
         if name in target.partition("<-")[0].split("+"):
             for key, (own, q) in KEYS.items():
                 same = family == own or (family == "load_friction" and own == "joint_friction")
-                if same and q in effect:
-                    one = known[param_name(str(effect["name"]), q)]
-                    found.setdefault(
-                        key, Estimate(one.value + (key == "gain"), one.std, unit=units.get(q, ""))
-                    )
+                if same and q in values:
+                    one = known[param_name(effect, q)]
+                    found.setdefault(key, replace(one, value=one.value + (key == "gain")))
         elif target == drives and family in RATES and by_unit:
             q, key = RATES[family]
-            one, unit = known[param_name(str(effect["name"]), q)], model.inputs[name]
+            one, unit = known[param_name(effect, q)], model.inputs[name]
             speed = model.states[drives].removesuffix("/s")
             unit = unit if q == "c" else f"{unit} s/{speed}"
             found.setdefault(key, Estimate(one.value / by_unit, one.std / by_unit, unit=unit))

@@ -159,10 +159,8 @@ def _python(workspace: Folder, source: Path, path: Path) -> TakenHome:
         if name not in hidden
     }
     told = [finding("model.no_place", n, value=changed[n].text) for n in hidden]
-    for effect in workspace.config.model.effects:
-        name = str(effect["name"])
-        c = {q: values[param_name(name, q)] for q in effect if q != "name"}
-        told.append(_not_held(name, c))
+    for name, own in workspace.config.model.effects.items():
+        told.append(_not_held(name, {q: values[param_name(name, q)] for q in own}))
     date, comment = _comment(workspace, taken, told)
     head, rest = _head(text)
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment)

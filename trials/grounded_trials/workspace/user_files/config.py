@@ -16,6 +16,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.search.step_size import SearchOptions
 from grounded_trials.store.store import write_atomically
@@ -27,6 +28,7 @@ FILE = "grounded.toml"
 DRIVE = "drive.py"  # the robot's program, as `init` writes it
 UNWRITTEN = "drive.py: complete measure() and send() for your robot"  # in it until the user does
 NOISES = ("start", "process", "measurement")  # of a simulated system
+Effects = Mapping[str, Mapping[str, float]]  # quantities by the effect's name, as they act
 OFFERED = 10  # terminal weights in the comment that `init` writes, as multiples of `state`
 
 
@@ -37,7 +39,7 @@ class ModelTable:
     file: str = ""
     module: str = ""
     params: Mapping[str, float] = field(default_factory=dict)
-    effects: tuple[Mapping[str, Any], ...] = ()
+    effects: Effects = field(default_factory=dict)
     priors: Mapping[str, float] = field(default_factory=dict)
     smoothing: float = 0.05
 
@@ -115,11 +117,16 @@ def read_config(folder: Path) -> Config:
 
 
 def _model(table: Table) -> ModelTable:
-    effects = table.take("effects", list, [])
-    for effect in effects:
-        if not isinstance(effect, dict) or not isinstance(effect.get("name"), str):
-            raise table.error("effects", "effects", effect)
-    found = table.into(ModelTable, effects=tuple(effects))
+    effects = dict[str, Mapping[str, float]]()
+    for one in table.take("effects", list, []):
+        name = one.get("name") if isinstance(one, dict) else None
+        if not isinstance(name, str):
+            raise table.error("effects", "effects", one)
+        if name in effects:
+            raise refused("given.twice", f"{table.file.name}: [model] effects", name=name)
+        rest = {q: value for q, value in one.items() if q != "name"}
+        effects[name] = Table(rest, table.file, f"model.effects.{name}").numbers()
+    found = table.into(ModelTable, effects=effects)
     if bool(found.file) == bool(found.module):
         raise table.error("file", "one", found.file or found.module)
     if found.smoothing < 0:
@@ -165,6 +172,11 @@ def _log(table: Table) -> Table:
             if "path" not in (one := group.sub(name)):
                 raise one.error("path", "path")
     return table
+
+
+def listed(effects: Effects) -> list[dict[str, Any]]:
+    """Return effects as grounded.toml and JSON list them."""
+    return [{"name": name, **values} for name, values in effects.items()]
 
 
 def as_toml(value: Any) -> Any:

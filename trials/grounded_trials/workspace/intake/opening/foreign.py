@@ -214,7 +214,7 @@ def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignL
     if guessed := [name for name in model.state_names if name not in states]:
         source["estimated"] = ",".join(guessed)
         kept = but_late_sensors(config.model.effects)
-        source[ESTIMATED_WITH] = ",".join(str(effect["name"]) for effect in kept)
+        source[ESTIMATED_WITH] = ",".join(kept)
     series = mapped_signals(files, mapping, states, model.input_names)
     return ForeignLog(workspace, path, mapping, estimate, series, source)
 
