@@ -16,14 +16,17 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from grounded.checks import finite, known, of_type, one_of, refused, unknown, whole_number, wrong
-from grounded.compile import Kind, Signature, System, system_of
+from grounded.compile import Kind, Signature, system_of
 from grounded.errors import alike
 from grounded.frozen import Array, readonly, wrapped
+
+if TYPE_CHECKING:
+    from grounded.compile.run.interpreted import System
 
 Function = Callable[..., Mapping[str, Any]]
 MAX_SUBSTEPS = 1000

@@ -3,16 +3,16 @@
 `system_of` is the door: it returns the fastest path that a user's function allows, and the paths
 agree, so that nobody above needs to know which one it was.
 
-Read `problem` first (what is solved, and what an engine must answer), then the rooms in the order
-in which a function passes through them: `trace` (run once on expressions, differentiated), `emit`
-(written as LLVM IR), `run` (the three engines). `names` hands arrays to the function by name.
+Read `problem` first (what is solved), then the rooms in the order in which a function passes
+through them: `trace` (run once on expressions, differentiated), `emit` (written as LLVM IR), `run`
+(the engines). `names` hands arrays to the function by name.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.compile.names import Named, Signature
 from grounded.compile.problem import (
@@ -24,9 +24,11 @@ from grounded.compile.problem import (
     Problem,
     Status,
     Swarm,
-    System,
     deepest,
 )
+
+if TYPE_CHECKING:
+    from grounded.compile.run.interpreted import System
 
 __all__ = [
     "Backward",
@@ -38,7 +40,6 @@ __all__ = [
     "Signature",
     "Status",
     "Swarm",
-    "System",
     "deepest",
     "system_of",
 ]

@@ -1,4 +1,4 @@
-"""A finite-horizon tracking problem in plain arrays, and what can be done with it (`System`).
+"""A finite-horizon tracking problem in plain arrays, and what is computed with it.
 
 The state a kernel works on is augmented with the inputs already sent, newest first, input by input,
 
@@ -15,24 +15,26 @@ receives, under a zero-order hold, the mean over the step (1 - phi) u_j[t-d] + p
 
 J is a COST: minus the paper's utility. Errors of states marked as angles wrap to [-pi, pi].
 
-A `System` is the model: compiled, traced or differenced (`run`), the same to all that is above, so
-that a black-box simulator serves as well as machine code. All arrays are float64 and C-contiguous.
+A `System` is the model: compiled or differenced (`run`), the same to all that is above, so that a
+black-box simulator serves as well as machine code. All arrays are float64 and C-contiguous.
 A state that leaves the finite numbers is returned as it is (NaN, inf), never raised: the caller
 turns it into a status.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from grounded.frozen import Array
+
+if TYPE_CHECKING:
+    from grounded.compile.run.interpreted import System
 
 # Box-limited quadratic programmes, see `llvm_box`.
 MAX_ITERATIONS = 50
@@ -86,8 +88,6 @@ def integrated(
 Kind = Literal["derivative", "step"]
 Integrator = Literal["rk4", "euler"]
 Limits = tuple[Array, Array]
-
-FLAT = 1e-9  # slope of a differenced function that is rounding
 
 
 def history_depths(delay: Array) -> tuple[int, ...]:
@@ -288,109 +288,3 @@ class Backward:
     d1: float
     d2: float
     failed_at: int
-
-
-class System(ABC):
-    """Discrete dynamics x_{t+1} = f(x_t, u_t; p) over a step dt, and the kernels built on them."""
-
-    n: int
-    m: int
-    k: int  # number of parameters
-    how: str  # "compiled", "compiled steps", "traced" or "differenced"
-    note: str  # why it is not compiled, naming the line; empty when it is
-    source: str  # file:line of the user's function
-    states: tuple[str, ...]  # names, for messages
-    inputs: tuple[str, ...]
-
-    @property
-    def simulated(self) -> bool:
-        """Whether each step is a call of the user's function: a simulator's takes milliseconds."""
-        return self.how == "differenced"
-
-    @abstractmethod
-    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
-        """From x (N, n), u (N, m) to the next x (N, n)."""
-
-    def reads(self, p: Array, dt: float) -> NDArray[np.bool_]:
-        """Which states and inputs each output of the user's function depends on, (n, n + m).
-
-        Of a black box, its next states, by slopes at a few points.
-        """
-        both = np.random.default_rng(0).uniform(0.2, 1.0, (8, self.n + self.m))
-        slopes = self.linearise(both[:, : self.n], both[:, self.n :], p, dt)
-        return np.asarray(np.abs(np.concatenate(slopes, axis=2)).max(axis=0) > FLAT)
-
-    @abstractmethod
-    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
-        """Compares a trace with the user's own function at points x (N, n), u (N, m).
-
-        Raises:
-            GroundedError: where they differ, with both values.
-        """
-
-    def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
-        """Where the user's function makes a number that is not finite, x (n,), u (m,); or ""."""
-        return ""
-
-    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
-        """Inputs (N, m) that lead from x (N, n) to about `after` (N, n); None where unknown."""
-        return None
-
-    def linearise(
-        self,
-        x: Array,
-        u: Array,
-        p: Array,
-        dt: float,
-        smoothing: float = 0.0,
-        limits: Limits | None = None,
-    ) -> tuple[Array, Array]:
-        """f_x (N, n, n) and f_u (N, n, m).
-
-        `limits` of the inputs, low and high (m,): derivatives that are differenced are taken
-        inwards there, as a simulator may clamp what lies beyond.
-        """
-        return self.slopes(Samples(x, u, p, dt, smoothing, limits))
-
-    @abstractmethod
-    def slopes(self, at: Samples) -> tuple[Array, Array]:
-        """What `linearise` returns."""
-
-    @abstractmethod
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """f_x (N, n, n), f_u (N, n, m) and f_p (N, n, k)."""
-
-    def rollout(
-        self,
-        problem: Problem,
-        ubar: Array,
-        K: Array | None = None,
-        zbar: Array | None = None,
-        k: Array | None = None,
-        alphas: Array | None = None,
-    ) -> Swarm:
-        """u_t = clip(ubar_t + alpha k_t + K_t (z_t - zbar_t)), from the problem's start.
-
-        ubar (H, m), K (H, m, nz), zbar (H, nz) or (H+1, nz), k (H, m), alphas (A,) or one of 1.
-        Differences of angles wrap.
-        """
-        steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
-        return self.runs(problem, Controls(ubar, K, zbar, k), steps)
-
-    @abstractmethod
-    def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
-        """What `rollout` returns, a run for each of alphas (A,)."""
-
-    @abstractmethod
-    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
-        """Linearise along z (H+1, nz), u (H, m) and sweep back, Q_uu + diag(damping), damping (m,).
-
-        Input limits are part of each step's quadratic programme (box-DDP, Tassa et al. 2014): the
-        rows of K of a clamped input are zero.
-        """
-
-    def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:
-        """The loop of `ddp.solve` from a first rollout; None where it is left to `ddp`."""
-        return None

@@ -31,16 +31,19 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from grounded.compile import System, system_of
+from grounded.compile import system_of
 from grounded.compile.names import Named
 from grounded.effects.drive import push, speed
 from grounded.effects.family import Effect, LossFamily, coupled
 from grounded.effects.plain_step import param_name
 from grounded.frozen import Array
+
+if TYPE_CHECKING:
+    from grounded.compile.run.interpreted import System
 
 SWEEPS = 3
 PARTS = 4  # implicit parts of a step

@@ -19,9 +19,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile import Backward, Problem, Swarm, System, deepest
+from grounded.compile import Problem, deepest
 from grounded.compile.problem import Controls, Samples
-from grounded.compile.run.interpreted import linearised, rolled_out, sweep
+from grounded.compile.run.interpreted import System
 from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
 from grounded.rollout import SETTLED, Rollout, seen_late
@@ -44,7 +44,7 @@ class Corrected(System):
         before: the same, one step earlier (H, m).
     """
 
-    how, note = "corrected", ""
+    how, note, kind = "corrected", "", "step"
 
     def __init__(self, base: System, law: Array, x: Array, u: Array, before: Array) -> None:
         self.base, self.law, self.x, self.u, self.before = base, law, x, u, before
@@ -76,8 +76,8 @@ class Corrected(System):
         before = np.vstack([self.before, self.u[-1:]])
         return np.hstack([z[:, :n], np.zeros((len(z), n)), before, z[:, n:]])
 
-    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
-        """See `System.step`; u is what the actuators received, without an input shift."""
+    def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
+        """See `System.evaluate`; u is what the actuators received, without an input shift."""
         moved = self.base.step(self._own(x), u, p, dt, smoothing)
         return self._next(moved, x, u, slice(None), np.zeros(self.base.n, bool))
 
@@ -85,46 +85,27 @@ class Corrected(System):
         """See `System.check`."""
         self.base.check(self._own(x), u, p, dt)
 
-    def slopes(self, at: Samples) -> tuple[Array, Array]:
-        """See `System.linearise`."""
-        x = at.x
-        n, m = self.base.n, self.m
-        f_x, f_u = self.base.slopes(at._replace(x=self._own(x)))
-        F, G = np.zeros((len(x), self.n, self.n)), np.zeros((len(x), self.n, m))
+    def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
+        """See `System.fault`."""
+        return self.base.fault(x[: self.base.n], u, p, dt)
+
+    def jacobian(self, at: Samples, width: int) -> Array:
+        """See `System.jacobian`."""
+        n, m, here = self.base.n, self.m, at._replace(x=self._own(at.x))
+        f_x, f_u = self.base.linearise(*here)
+        J = np.zeros((len(at.x), self.n, width))
         by_x, by_u, by_before, by_y = np.split(self.law, np.cumsum([n, m, m]), axis=2)
-        F[:, n : 2 * n, : 2 * n + m] = np.concatenate([by_x, by_y, by_before], axis=2)
-        G[:, n : 2 * n] = by_u
-        F[:, :n], G[:, :n] = F[:, n : 2 * n], by_u + f_u
-        F[:, :n, :n] += f_x
-        G[:, 2 * n : 2 * n + m] = np.eye(m)
-        return F, G
-
-    def sensitivities(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
-    ) -> tuple[Array, Array, Array]:
-        """See `System.sensitivities`."""
-        f_p = self.base.sensitivities(self._own(x), u, p, dt, smoothing)[2]
-        by_p = np.zeros((len(x), self.n, self.k))
-        by_p[:, : self.base.n] = f_p
-        return *self.linearise(x, u, p, dt, smoothing), by_p
-
-    def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
-        """See `System.rollout`."""
-
-        def step(x: Array, sent: Array, t: int) -> Array:
-            return self.stepped(problem, x, sent, t)
-
-        return rolled_out(problem, step, by, alphas)
+        J[:, n : 2 * n, : 2 * n + 2 * m] = np.concatenate([by_x, by_y, by_before, by_u], axis=2)
+        J[:, :n] = J[:, n : 2 * n]
+        J[:, :n, :n] += f_x
+        J[:, :n, self.n : self.n + m] += f_u
+        J[:, 2 * n :, self.n : self.n + m] = np.eye(m)
+        if width > self.n + m:
+            J[:, :n, self.n + m :] = self.base.sensitivities(*here[:5])[2]
+        return J
 
     def stepped(self, problem: Problem, x: Array, sent: Array, t: int) -> Array:
-        """Return the states after step t of a problem, without its bias.
-
-        Args:
-            problem: in this system.
-            x: states (N, 2 n + m).
-            sent: received inputs (N, m), less the input shift.
-            t: index of the step.
-        """
+        """See `System.stepped`; `sent` (N, m) is less the input shift."""
         state, settings = self._own(x), (problem.dt, problem.smoothing)
         moved = self.base.step(state, np.ascontiguousarray(sent), problem.p, *settings)
         shift = 0.0 if problem.input_shift is None else problem.input_shift[t]
@@ -150,11 +131,6 @@ class Corrected(System):
         d = np.concatenate([away, u - self.u[t], before, x[:, n : 2 * n]], axis=1)
         y = np.einsum("...nq,...q->...n", self.law[t], d)
         return np.concatenate([moved + y, y, u], axis=1)
-
-    def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
-        """See `System.backward`."""
-        with np.errstate(all="ignore"):
-            return sweep(problem, u, linearised(self, problem, z, u), damping)
 
 
 def runs(problems: Sequence[Problem], policies: Sequence[Policy]) -> list[Rollout]:

@@ -6,10 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from facts import holding
-from grounded.compile import system_of
-from grounded.compile.names import Signature
-from grounded.compile.run.traced import TracedSystem
-from grounded.compile.trace.tracing import trace
+from grounded.compile import Named, system_of
 from grounded.effects import Library, wrap
 from grounded.errors import GroundedError
 from grounded.experiments.figure8 import flight_task
@@ -97,41 +94,50 @@ def by_all(step, x, u, p, size=1e-6):
     )
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=8, deadline=None)
 @example("s.x", ("and", "s.x", ("add", ("and", "1.3", "1.3"), "s.x")), 0)  # an array without axes
 @given(trees, trees, st.integers(0, 10_000))
-def test_derivatives_of_made_up_expressions(left, right, seed):
-    """Indicator terms with a width of 0.5, so that they have derivatives everywhere."""
-    signature = Signature(model_of(left, right), "step_like", **SPACE)  # a derivative's arguments
+def test_made_up_expressions_are_those_of_the_function_and_differentiated(left, right, seed):
+    """Derivatives with a width of 0.5, so that indicator terms have them everywhere."""
+    model = model_of(left, right)
+    made = system_of(lambda s, a, p, dt: model(s, a, p), kind="step", **SPACE)
     rng = np.random.default_rng(seed)
-    x, u, p = rng.normal(size=(3, 2)), rng.normal(size=(3, 1)), rng.normal(size=2)
-    traced = TracedSystem(signature, trace(signature, p, 0.1), "euler", "")
-    traced.kind = "step"
-    exact = traced.sensitivities(x, u, p, 0.1, 0.5)
+    x, u, p = rng.normal(size=(11, 2)), rng.normal(size=(11, 1)), rng.normal(size=2)
+    assert made.how == "compiled"
+    columns = zip(SPACE.items(), (x.T, u.T, p), strict=True)
+    own = model(*(Named(what, names, [*values]) for (what, names), values in columns))
+    own = np.column_stack([np.broadcast_to(own[name], 11) for name in SPACE["states"]])
+    np.testing.assert_allclose(made.step(x, u, p, 0.1), own, rtol=1e-10, atol=1e-10)
+    exact = made.sensitivities(x, u, p, 0.1, 0.5)
     for found, near in zip(
-        exact, by_all(lambda *at: traced.step(*at, 0.1, 0.5), x, u, p), strict=True
+        exact, by_all(lambda *at: made.step(*at, 0.1, 0.5), x, u, p), strict=True
     ):
         assert np.allclose(found, near, rtol=1e-6, atol=1e-6 * (1 + np.abs(near).max()))
 
 
-@settings(max_examples=6, deadline=None)
-@given(trees, trees, st.integers(0, 10_000), st.sampled_from([0.0, 0.3]))
-def test_compiled_agrees_with_interpreted(left, right, seed, eps):
-    model = model_of(left, right)
-    compiled = system_of(model, kind="derivative", integrator="rk4", **SPACE)
-    signature = Signature(model, "derivative", **SPACE)
-    rng = np.random.default_rng(seed)
-    x, u, p = rng.normal(size=(11, 2)), rng.normal(size=(11, 1)), rng.normal(size=2)
-    traced = TracedSystem(signature, trace(signature, p, 0.1), "rk4", "")
-    assert compiled.how == "compiled"
-    a, b = compiled.step(x, u, p, 0.1, eps), traced.step(x, u, p, 0.1, eps)
-    assert np.allclose(a, b, rtol=1e-10, atol=1e-10)
-    for mine, theirs in zip(
-        compiled.sensitivities(x, u, p, 0.1, eps),
-        traced.sensitivities(x, u, p, 0.1, eps),
-        strict=True,
-    ):
-        assert np.allclose(mine, theirs, rtol=1e-10, atol=1e-10)
+def test_smoothed_terms_are_their_formulas():
+    terms = {
+        "where": (lambda x, y: np.where(x > y, x, 2.0), lambda x, y, w, r: w * x + (1 - w) * 2.0),
+        "abs": (lambda x, y: np.abs(x - y), lambda x, y, w, r: r),
+        "sign": (lambda x, y: np.sign(x - y), lambda x, y, w, r: (x - y) / r),
+        "max": (np.maximum, lambda x, y, w, r: 0.5 * (x + y + r)),
+        "and": (lambda x, y: (x > y) & ~(x > y), lambda x, y, w, r: w * (1 - w)),
+        "or": (lambda x, y: (x > y) | (y > x), lambda x, y, w, r: 1 - w * (1 - w)),
+    }
+
+    def step(s, a, p, dt):
+        return {name: term(s["where"], s["abs"]) for name, (term, _) in terms.items()}
+
+    made = system_of(step, kind="step", states=terms, inputs=("u",), params=())
+    x = np.random.default_rng(0).normal(size=(9, 6))
+    for eps in (0.03, 0.5, 1e-5):
+        one, other = x[:, 0], x[:, 1]
+        with np.errstate(over="ignore"):
+            w = 1 / (1 + np.exp(-(one - other) / eps))
+        root = np.sqrt((one - other) ** 2 + eps**2)
+        expected = np.column_stack([by(one, other, w, root) for _, by in terms.values()])
+        found = made.step(x, np.zeros((9, 1)), np.zeros(0), 0.1, eps)
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-15)
 
 
 def test_a_branch_not_taken_never_leaks_nan():
@@ -141,17 +147,14 @@ def test_a_branch_not_taken_never_leaks_nan():
         return {"x": root, "v": inverse + np.maximum(s.x, -np.inf)}
 
     made = system_of(model, kind="derivative", **SPACE)
-    signature = Signature(model, "derivative", **SPACE)
-    twin = TracedSystem(signature, trace(signature, None, 0.1), "rk4", "")
     x = np.array([[-1.0, -2.0], [1.0, 6.0], [-0.02, 8.0], [-0.5, -3.0]])
     for eps in (0.0, 0.1):
         u, p = np.ones((4, 1)), np.ones(2)
-        for some in (made, twin):
-            f_x, f_u = some.linearise(x[:3], u[:3], p, 1e-3, eps)
-            if eps == 0.0:
-                y = some.step(x[:, :], u, p, 1e-3, eps)
-                assert np.isfinite(y[:3, 0]).all()
-            assert np.isfinite(f_x[:, 0]).all() and np.isfinite(f_u[:, 0]).all()
+        f_x, f_u = made.linearise(x[:3], u[:3], p, 1e-3, eps)
+        if eps == 0.0:
+            y = made.step(x[:, :], u, p, 1e-3, eps)
+            assert np.isfinite(y[:3, 0]).all()
+        assert np.isfinite(f_x[:, 0]).all() and np.isfinite(f_u[:, 0]).all()
 
 
 @pytest.mark.parametrize("eps", [0.0, 0.05])
@@ -163,16 +166,14 @@ def test_what_is_infinitely_steep_at_rest_has_a_slope_there(eps):
             "v": np.arctan2(s.v, s.x) + np.cbrt(s.v) + np.abs(s.x) ** 0.7 + np.arcsin(1 - s.x**2),
         }
 
-    signature = Signature(drag, "derivative", **SPACE)
-    twin = TracedSystem(signature, trace(signature, None, 0.1), "euler", "")
     x, u, p = np.zeros((1, 2)), np.ones((1, 1)), np.ones(2)
-    for some in (system_of(drag, kind="derivative", integrator="euler", **SPACE), twin):
-        f_x, f_u, f_p = some.sensitivities(x, u, p, 0.1, eps)
-        np.testing.assert_array_equal(f_x[0], np.eye(2))
-        np.testing.assert_allclose(f_u[0], [[0.1], [0.0]])
-        np.testing.assert_array_equal(f_p[0], 0.0)
-        away = some.linearise(np.array([[3.0, 4.0]]), u, p, 0.1, eps)[0][0]
-        assert away[0, 1] == pytest.approx(-0.1 * (3 * 0.8 + 0.8))
+    made = system_of(drag, kind="derivative", integrator="euler", **SPACE)
+    f_x, f_u, f_p = made.sensitivities(x, u, p, 0.1, eps)
+    np.testing.assert_array_equal(f_x[0], np.eye(2))
+    np.testing.assert_allclose(f_u[0], [[0.1], [0.0]])
+    np.testing.assert_array_equal(f_p[0], 0.0)
+    away = made.linearise(np.array([[3.0, 4.0]]), u, p, 0.1, eps)[0][0]
+    assert away[0, 1] == pytest.approx(-0.1 * (3 * 0.8 + 0.8))
 
 
 def test_smoothing_narrows_to_the_exact_branch():

@@ -19,7 +19,7 @@ from grounded.compile.emit.llvm_graph import DT, Body, Uniforms
 from grounded.compile.emit.llvm_text import Writer, doubles, integers, number, splat
 from grounded.compile.problem import STAGES
 from grounded.compile.trace.graph import Graph
-from grounded.compile.trace.tracing import Variant
+from grounded.compile.trace.tracing import Trace
 
 Place = tuple[int, int]  # row, column of a Jacobian
 WIDEST = 8  # doubles in a vector
@@ -101,13 +101,11 @@ class Dynamics:
         return bool(self.stages) and place >= len(self.rates)
 
 
-def dynamics_of(
-    variant: Variant, n: int, m: int, width: int, kind: str, integrator: str
-) -> Dynamics:
+def dynamics_of(trace: Trace, width: int, kind: str, integrator: str) -> Dynamics:
     """The dynamics with derivatives for the first `width` of x, u, p."""
-    entries = {(r, c): i for r, c, i in (variant.entries(width) if width else ())}
+    entries = {(r, c): i for r, c, i in (trace.entries(width) if width else ())}
     stages = STAGES[integrator] if kind == "derivative" else ()
-    return Dynamics(variant.trace.graph, variant.trace.outputs, entries, n, m, stages)
+    return Dynamics(trace.graph, trace.outputs, entries, *trace.sizes[:2], stages)
 
 
 class StepWriter:

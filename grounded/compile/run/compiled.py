@@ -3,7 +3,7 @@
 Three modules, each made when it is first asked for: steps and Jacobians of many samples; rollouts
 and sweeps about one layout of z (its delays); the sensitivities that a fit needs. Parameters, bias,
 targets and weights are arguments: one compile serves every trial, every perturbed model, every fit.
-What can't be compiled, or would take too long to, is left to the interpreted twin (`traced.py`).
+What would take too long to compile is left to NumPy (`interpreted.py`).
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ import hashlib
 import struct
 import threading
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from grounded.checks import refused
 from grounded.compile.kernel_words import (
     BATCH,
     COST,
@@ -41,10 +44,9 @@ from grounded.compile.problem import (
     Descent,
     DescentOptions,
     Integrator,
+    Limits,
     Problem,
-    Samples,
     Swarm,
-    System,
 )
 from grounded.compile.run import jit
 from grounded.compile.run.arguments import (
@@ -56,14 +58,10 @@ from grounded.compile.run.arguments import (
     table,
 )
 from grounded.compile.run.differenced import DifferencedSystem
-from grounded.compile.run.interpreted import Interpreted
-from grounded.compile.run.traced import TracedSystem
+from grounded.compile.run.interpreted import System
 from grounded.compile.trace.graph import TooLong
-from grounded.compile.trace.tracing import Trace, Variant, trace
+from grounded.compile.trace.tracing import Trace, trace
 from grounded.frozen import Array
-
-if TYPE_CHECKING:
-    from grounded.compile.emit.modules import Source
 
 Words = ctypes.c_int64 * len(BATCH)
 RESULTS = BATCH[6:]
@@ -72,17 +70,18 @@ UNCOUNTED = 600  # operations of a model, or places of its Jacobian, of which no
 MAX_COMPILED = 30_000  # operations that kernels are written with, about 7 s of compiling
 MAX_STEPS = 4_000  # of a model alone, where its derivatives are too many
 MAX_PLACES = 8_000  # of a Jacobian that a kernel keeps on its stack, 4 MB of it
+AGREE = 1e-9  # a trace and its original, relative to the size of the state's values
 FORMAT = 1  # raise when kernels change their words or their meaning
 
 
 class Kernels:
     """The compiled modules of one trace, each made (or loaded) when it is first called."""
 
-    def __init__(self, variant: Variant, system: CompiledSystem) -> None:
-        n, m, k = self.sizes = (system.n, system.m, system.k)
-        self._variant, self._kind, self._integrator = variant, system.kind, system.integrator
+    def __init__(self, trace: Trace, system: CompiledSystem) -> None:
+        self._about = trace, system.kind, system.integrator
         self._derivatives = system.derivatives
-        graph = variant.trace.graph.digest(variant.trace.outputs)  # its derivatives follow from it
+        graph = trace.graph.digest(trace.outputs)  # its derivatives follow from it
+        n, m, k = trace.sizes
         self._key = (
             f"{FORMAT} {jit.writers()} {graph} {n} {m} {k} {system.kind} {system.integrator} "
             f"{system.derivatives}"
@@ -116,21 +115,13 @@ class Kernels:
             return self._libraries[key]
 
     def text(self, which: Layout | str) -> str:
-        """Write the LLVM code of a kernel."""
-        return self._source().text(which, jit.lanes())
+        """Write the LLVM code of a module; only what no cache holds is written."""
+        from grounded.compile.emit.modules import module_text
 
-    def operations(self) -> int:
-        """Count what would be written."""
-        return self._source().operations
-
-    def _source(self) -> Source:
-        from grounded.compile.emit.modules import Source  # only what no cache holds is written
-
-        about = (self._variant, self.sizes, self._kind, self._integrator)
-        return Source(*about, self._derivatives)
+        return module_text(*self._about, which, jit.lanes(), self._derivatives)
 
 
-class CompiledSystem(TracedSystem):
+class CompiledSystem(System):
     """A traced function, compiled."""
 
     how = "compiled"
@@ -139,21 +130,67 @@ class CompiledSystem(TracedSystem):
     def __init__(
         self, signature: Signature, first: Trace, integrator: Integrator, note: str = ""
     ) -> None:
-        super().__init__(signature, first, integrator, note)
+        super().__init__(signature, integrator, note)
+        self._traces = [first] if not first.guards else []
         self._kernels: dict[int, Kernels] = {}
+        self._differenced = False  # whether derivatives by the parameters are too long to compile
 
     @property
     def operations(self) -> int:
         """Operations of the kernels where the model is large; 0 says it is small."""
+        from grounded.compile.emit.modules import operations
+
         places = self.n * (self.n + self.m)
-        large = [v for v in self._variants if max(len(v.trace.graph.nodes), places) > UNCOUNTED]
-        return max((Kernels(variant, self).operations() for variant in large), default=0)
+        large = [one for one in self._traces if max(len(one.graph.nodes), places) > UNCOUNTED]
+        return max((operations(one, self.kind, self.integrator) for one in large), default=0)
+
+    @cached_property
+    def original(self) -> DifferencedSystem:
+        """The function as it is."""
+        return DifferencedSystem(self.signature, self.integrator)
+
+    def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
+        """See `System.evaluate`."""
+        return self.original.evaluate(x, u, p, dt, smoothing)
+
+    def trace(self, p: Array, dt: float) -> Trace:
+        """The trace that holds for these parameters.
+
+        Raises:
+            GroundedError: when the branch they take can't be traced.
+        """
+        for known in self._traces:
+            if known.holds(p, dt):
+                return known
+        found = trace(self.signature, np.asarray(p, float), dt)
+        if isinstance(found, str):
+            raise refused("model.untraced", why=found)
+        self._traces.append(found)
+        return found
+
+    def reads(self, p: Array, dt: float) -> NDArray[np.bool_]:
+        """See `System.reads`; by the graph."""
+        return self.trace(p, dt).reads
+
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """See `System.check`."""
+        x, u = np.asarray(x, float), np.asarray(u, float)
+        mine, theirs = self.step(x, u, p, dt), self.original.step(x, u, p, dt)
+        scale = 1.0 + np.max(np.abs(theirs), axis=0, initial=0.0, where=np.isfinite(theirs))
+        differ = ~np.isclose(mine, theirs, rtol=AGREE, atol=0.0, equal_nan=True)
+        with np.errstate(all="ignore"):
+            differ &= ~(np.abs(mine - theirs) <= AGREE * scale)
+        if differ.any():
+            t, i = np.argwhere(differ)[0]
+            ours, own = float(mine[t, i]), float(theirs[t, i])
+            name = self.signature.states[i]
+            raise refused("model.differs", self.source, state=name, ours=ours, own=own)
 
     def _compiled(self, p: Array, dt: float) -> Kernels:
-        variant = self.variant(p, dt)
-        kernels = self._kernels.get(id(variant))
+        found = self.trace(p, dt)
+        kernels = self._kernels.get(id(found))
         if kernels is None:
-            kernels = self._kernels.setdefault(id(variant), Kernels(variant, self))
+            kernels = self._kernels.setdefault(id(found), Kernels(found, self))
         return kernels
 
     def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
@@ -186,9 +223,16 @@ class CompiledSystem(TracedSystem):
             t += count
         return z
 
-    def slopes(self, at: Samples) -> tuple[Array, Array]:
+    def linearise(
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float = 0.0,
+        limits: Limits | None = None,
+    ) -> tuple[Array, Array]:
         """See `System.linearise`."""
-        x, u, p, dt, smoothing, _ = at
         N, n = len(x), self.n
         f_x, f_u = np.zeros((N, n, n)), np.zeros((N, n, self.m))
         library = self._compiled(p, dt).batch()
@@ -201,7 +245,6 @@ class CompiledSystem(TracedSystem):
         """See `System.sensitivities`."""
         full = self._full(p, dt)
         if full is None:
-            self._too_long.add(self.n + self.m + self.k)
             return super().sensitivities(x, u, p, dt, smoothing)
         N, n = len(x), self.n
         f_x, f_u, f_p = np.zeros((N, n, n)), np.zeros((N, n, self.m)), np.zeros((N, n, self.k))
@@ -211,11 +254,12 @@ class CompiledSystem(TracedSystem):
 
     def _full(self, p: Array, dt: float) -> jit.Library | None:
         """Derivatives by the parameters too; None where they are too many to compile."""
-        if self.n * (self.n + self.m + self.k) > MAX_PLACES or sum(self.sizes) in self._too_long:
+        if self.n * (self.n + self.m + self.k) > MAX_PLACES or self._differenced:
             return None
         try:
             return self._compiled(p, dt).full()
         except TooLong:
+            self._differenced = True
             return None
 
     def _batch(
@@ -307,14 +351,10 @@ class CompiledSteps(CompiledSystem):
     how = "compiled steps"
     derivatives = False
 
-    def jacobian(self, at: Samples, width: int) -> Array:
-        """See `Interpreted.jacobian`."""
-        return self.differences(at, width)
-
-    slopes = TracedSystem.slopes
-    sensitivities = TracedSystem.sensitivities
-    backward = TracedSystem.backward
-    descend = TracedSystem.descend
+    linearise = System.linearise
+    sensitivities = System.sensitivities
+    backward = System.backward
+    descend = System.descend
 
 
 def _policy(by: Controls) -> dict[str, Any]:
@@ -347,15 +387,15 @@ def system_from(signature: Signature, integrator: Integrator, derivatives: bool 
             size = str(error)
     slow = f"({place}): to compile {size} would take too long; it is planned with all the same"
     if len(found.graph.live(found.outputs)) > MAX_STEPS:
-        return TracedSystem(signature, found, integrator, f"not compiled {slow}, more slowly")
+        return DifferencedSystem(signature, integrator, f"not compiled {slow}, more slowly")
     note = f"compiled but for its derivatives {slow}, more slowly"
     return CompiledSteps(signature, found, integrator, note)
 
 
-def _again(system: Interpreted) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+def _again(system: System) -> tuple[Callable[..., Any], tuple[Any, ...]]:
     """In another process it is made again from the function: code and caches stay here."""
     return system_from, (system.signature, system.integrator)
 
 
-for engine in (CompiledSteps, CompiledSystem, DifferencedSystem, TracedSystem):
+for engine in (CompiledSteps, CompiledSystem, DifferencedSystem):
     copyreg.pickle(engine, _again)

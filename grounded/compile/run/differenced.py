@@ -23,7 +23,7 @@ import numpy as np
 from grounded.checks import refused, wrong
 from grounded.compile.names import Named, check_names, raised_at, where, wrong_value
 from grounded.compile.problem import Samples
-from grounded.compile.run.interpreted import RELATIVE_STEP, Interpreted
+from grounded.compile.run.interpreted import RELATIVE_STEP, System
 from grounded.errors import GroundedError
 from grounded.foreign import contained
 from grounded.frozen import Array
@@ -41,7 +41,7 @@ SINGLE = (
 )
 
 
-class DifferencedSystem(Interpreted):
+class DifferencedSystem(System):
     """Any Python callable as a System."""
 
     how = "differenced"
@@ -87,17 +87,13 @@ class DifferencedSystem(Interpreted):
             by = (*self.signature.states, *self.signature.inputs)[j]
             raise refused("model.differs", where(own), state=self.states[i], by=by, off=off.max())
 
-    def slopes(self, at: Samples) -> tuple[Array, Array]:
-        """See `Interpreted.slopes`; without smoothing, which changes nothing here."""
-        return super().slopes(at._replace(smoothing=0.0))
-
     def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
         """See `System.inverse`; the function may have one, as simulators do."""
         known = getattr(self.signature.function, "inverse", None)
         return None if known is None else known(x, after, p, dt)
 
     def jacobian(self, at: Samples, width: int) -> Array:
-        """See `Interpreted.jacobian`; by central differences.
+        """See `System.jacobian`; by central differences.
 
         Where derivatives come with the model, those by a parameter are taken to one side: half the
         steps, and none with a friction below zero.

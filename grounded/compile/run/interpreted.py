@@ -1,8 +1,7 @@
-"""What the two NumPy engines share: integration, rollouts, the cost and the Riccati sweep.
+"""What any engine answers (`System`), in NumPy: integration, rollouts, differences, the sweep.
 
-A subclass of `Interpreted` evaluates the user's function on N samples at once and differentiates
-it; how it does so (`differenced.py` calls the function, `traced.py` runs its graph) is all that
-differs. The rest are the twins of the compiled kernels, in the same order of steps.
+A subclass evaluates the user's function on N samples at once (`differenced.py`), or replaces what
+is here by machine code in the same order of steps (`compiled.py`).
 
 The sweep (theory: `ddp.py`). The problem about a trajectory is linear dynamics of z and a quadratic
 cost (`Quadratic`): with q the past inputs (`Queue`),
@@ -26,8 +25,7 @@ free set are the inputs that no bound holds back.
 from __future__ import annotations
 
 import copy
-from abc import abstractmethod
-from collections.abc import Callable
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,18 +36,21 @@ from grounded.compile.problem import (
     STOP,
     Backward,
     Controls,
+    Descent,
+    DescentOptions,
     Integrator,
+    Limits,
     Problem,
     Queue,
     Samples,
     Swarm,
-    System,
     integrated,
 )
 from grounded.frozen import Array, wrapped
 
 RELATIVE_STEP = float(np.cbrt(np.finfo(float).eps))  # of differences in double precision
 CHUNK = 4096  # samples in one call, so that long horizons don't fill the memory
+FLAT = 1e-9  # slope of a differenced function that is rounding
 
 
 def stencil(at: Array, h: Array, low: Array, high: Array) -> tuple[Array, Array]:
@@ -61,14 +62,17 @@ def stencil(at: Array, h: Array, low: Array, high: Array) -> tuple[Array, Array]
     return down, np.minimum(at + h, np.maximum(at, high))
 
 
-class Interpreted(System):
-    """A System whose kernels are NumPy.
+class System(ABC):
+    """Discrete dynamics x_{t+1} = f(x_t, u_t; p) over a step dt, and the kernels built on them.
 
     Args:
         signature: the user's function and its names.
         integrator: for a derivative.
-        note: why it is not compiled.
+        note: why it is not compiled, naming the line; empty when it is.
     """
+
+    how: str  # "compiled", "compiled steps" or "differenced"
+    _latest: tuple[Samples, tuple[Array, Array]] | None = None  # differentiated, their slopes
 
     def __init__(
         self, signature: Signature, integrator: Integrator = "rk4", note: str = ""
@@ -78,18 +82,37 @@ class Interpreted(System):
         self.source = where(signature.function)
         self.n, self.m, self.k = self.sizes = signature.sizes
 
-    _latest: tuple[Samples, tuple[Array, Array]] | None = None  # differentiated, their slopes
+    @property
+    def simulated(self) -> bool:
+        """Whether each step is a call of the user's function: a simulator's takes milliseconds."""
+        return self.how == "differenced"
 
     @abstractmethod
     def evaluate(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
         """The user's function: x (N, n), u (N, m), p (k,) -> ds/dt or next state (N, n)."""
 
     @abstractmethod
-    def jacobian(self, at: Samples, width: int) -> Array:
-        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
+    def check(self, x: Array, u: Array, p: Array, dt: float) -> None:
+        """Compares a trace with the user's own function at points x (N, n), u (N, m).
+
+        Raises:
+            GroundedError: where they differ, with both values.
+        """
+
+    def reads(self, p: Array, dt: float) -> NDArray[np.bool_]:
+        """Which states and inputs each output of the user's function depends on, (n, n + m).
+
+        Of a black box, its next states, by slopes at a few points.
+        """
+        both = np.random.default_rng(0).uniform(0.2, 1.0, (8, self.n + self.m))
+        slopes = self.linearise(both[:, : self.n], both[:, self.n :], p, dt)
+        return np.asarray(np.abs(np.concatenate(slopes, axis=2)).max(axis=0) > FLAT)
 
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
-        """See `System.fault`; at the state itself, and where a first stage of the step goes."""
+        """Where the user's function makes a number that is not finite, x (n,), u (m,); or "".
+
+        At the state itself, and where a first stage of the step goes.
+        """
         signature = self.signature
         sent, known = ([np.float64(v) for v in values] for values in (u, p))
         for _ in range(2):
@@ -109,16 +132,42 @@ class Interpreted(System):
             x = x + 0.5 * dt * found
         return ""
 
-    def slopes(self, at: Samples) -> tuple[Array, Array]:
-        """See `System.linearise`; the latest are kept (read-only).
+    def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
+        """Inputs (N, m) that lead from x (N, n) to about `after` (N, n); None where unknown."""
+        return None
+
+    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
+        """From x (N, n), u (N, m) to the next x (N, n)."""
+        with np.errstate(all="ignore"):
+            if self.kind == "step":
+                return self.evaluate(x, u, p, dt, smoothing)
+
+            def rate(at: list[Array]) -> list[Array]:
+                return [self.evaluate(at[0], u, p, dt, smoothing)]
+
+            return np.asarray(integrated(rate, [x], dt, self.integrator)[0])
+
+    def linearise(
+        self,
+        x: Array,
+        u: Array,
+        p: Array,
+        dt: float,
+        smoothing: float = 0.0,
+        limits: Limits | None = None,
+    ) -> tuple[Array, Array]:
+        """f_x (N, n, n) and f_u (N, n, m), read-only; the latest are kept.
 
         A sweep is repeated with more damping, a search goes on where it stopped, and gains are
         designed along its plan: all of these differentiate the same samples.
+
+        `limits` of the inputs, low and high (m,): derivatives that are differenced are taken
+        inwards there, as a simulator may clamp what lies beyond.
         """
+        at = Samples(x, u, p, dt, 0.0 if self.simulated else smoothing, limits)
         if self._latest is not None and _same(self._latest[0], at):
             return self._latest[1]
-        J = self.jacobian(at, self.n + self.m)
-        f_x, f_u = np.split(J, [self.n], axis=2)
+        f_x, f_u = np.split(self.jacobian(at, self.n + self.m), [self.n], axis=2)
         found = np.ascontiguousarray(f_x), np.ascontiguousarray(f_u)
         self._latest = copy.deepcopy(at), found
         for slopes in found:
@@ -128,10 +177,14 @@ class Interpreted(System):
     def sensitivities(
         self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0
     ) -> tuple[Array, Array, Array]:
-        """See `System.sensitivities`."""
-        J = self.jacobian(Samples(x, u, p, dt, smoothing), sum(self.sizes))
+        """f_x (N, n, n), f_u (N, n, m) and f_p (N, n, k)."""
+        J = self.jacobian(Samples(x, u, p, dt, smoothing), self.n + self.m + self.k)
         f_x, f_u, f_p = np.split(J, [self.n, self.n + self.m], axis=2)
         return np.ascontiguousarray(f_x), np.ascontiguousarray(f_u), np.ascontiguousarray(f_p)
+
+    def jacobian(self, at: Samples, width: int) -> Array:
+        """Derivatives of `step` by the first `width` of x, u and p, (N, n, width)."""
+        return self.differences(at, width)
 
     def differences(self, at: Samples, width: int, relative: float = RELATIVE_STEP) -> Array:
         """Central differences of `step`, like `jacobian`.
@@ -173,29 +226,61 @@ class Interpreted(System):
         with np.errstate(all="ignore"):
             return np.asarray((y[0] - y[1]).transpose(1, 2, 0) / width[:, None, :])
 
-    def step(self, x: Array, u: Array, p: Array, dt: float, smoothing: float = 0.0) -> Array:
-        """See `System.step`."""
-        with np.errstate(all="ignore"):
-            if self.kind == "step":
-                return self.evaluate(x, u, p, dt, smoothing)
+    def rollout(
+        self,
+        problem: Problem,
+        ubar: Array,
+        K: Array | None = None,
+        zbar: Array | None = None,
+        k: Array | None = None,
+        alphas: Array | None = None,
+    ) -> Swarm:
+        """u_t = clip(ubar_t + alpha k_t + K_t (z_t - zbar_t)), from the problem's start.
 
-            def rate(at: list[Array]) -> list[Array]:
-                return [self.evaluate(at[0], u, p, dt, smoothing)]
-
-            return np.asarray(integrated(rate, [x], dt, self.integrator)[0])
+        ubar (H, m), K (H, m, nz), zbar (H, nz) or (H+1, nz), k (H, m), alphas (A,) or one of 1.
+        Differences of angles wrap.
+        """
+        steps = np.ones(1) if alphas is None else np.asarray(alphas, float)
+        return self.runs(problem, Controls(ubar, K, zbar, k), steps)
 
     def runs(self, problem: Problem, by: Controls, alphas: Array) -> Swarm:
-        """See `System.rollout`."""
+        """What `rollout` returns, a run for each of alphas (A,).
 
-        def step(x: Array, sent: Array, t: int) -> Array:
-            return self.step(x, sent, problem.p, problem.dt, problem.smoothing)
+        Each run may have a policy and a bias of its own, (A, ...), or all the same ones.
+        """
+        ubar, K, zbar, k = by
+        queue, n, runs = problem.queue, self.n, len(alphas)
+        z = np.empty((runs, problem.horizon + 1, problem.nz))
+        u = np.empty((runs, problem.horizon, self.m))
+        z[:, 0], u[:] = problem.z_start(), ubar if k is None else ubar + alphas[:, None, None] * k
+        with np.errstate(all="ignore"):
+            for t in range(problem.horizon):
+                if K is not None and zbar is not None:
+                    off = wrapped(z[:, t] - zbar[..., t, :], problem.angles)
+                    u[:, t] += (K[..., t, :, :] @ off[:, :, None])[:, :, 0]
+                u[:, t] = np.clip(u[:, t], problem.low, problem.high)
+                sent = problem.received(z[:, t], u[:, t], t)
+                moved = self.stepped(problem, z[:, t, :n], sent, t)
+                z[:, t + 1, :n] = moved + problem.bias[..., t, :]
+                z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
+        return Swarm(z, u, trajectory_cost(problem, z, u))
 
-        return rolled_out(problem, step, by, alphas)
+    def stepped(self, problem: Problem, x: Array, sent: Array, t: int) -> Array:
+        """The states (N, n) after step t with received inputs (N, m), without the bias."""
+        return self.step(x, sent, problem.p, problem.dt, problem.smoothing)
 
     def backward(self, problem: Problem, z: Array, u: Array, damping: Array) -> Backward:
-        """See `System.backward`."""
+        """Linearise along z (H+1, nz), u (H, m) and sweep back, Q_uu + diag(damping), damping (m,).
+
+        Input limits are part of each step's quadratic programme (box-DDP, Tassa et al. 2014): the
+        rows of K of a clamped input are zero.
+        """
         with np.errstate(all="ignore"):
             return sweep(problem, u, linearised(self, problem, z, u), damping)
+
+    def descend(self, problem: Problem, first: Controls, options: DescentOptions) -> Descent | None:
+        """The loop of `ddp.solve` from a first rollout; None where it is left to `ddp`."""
+        return None
 
 
 def _same(one: Samples, other: Samples) -> bool:
@@ -204,33 +289,6 @@ def _same(one: Samples, other: Samples) -> bool:
     limited = len(limits[0]) == len(limits[1]) and all(map(np.array_equal, *limits))
     numbers = (one.dt, one.smoothing) == (other.dt, other.smoothing)
     return limited and numbers and all(map(np.array_equal, one[:3], other[:3]))
-
-
-def rolled_out(
-    problem: Problem,
-    step: Callable[[Array, Array, int], Array],
-    by: Controls,
-    alphas: Array,
-) -> Swarm:
-    """`System.runs` with a step from x (A, n), received inputs (A, m) and t to the next x.
-
-    Each run may have a policy and a bias of its own, (A, ...), or all the same ones.
-    """
-    ubar, K, zbar, k = by
-    queue, n, runs = problem.queue, problem.system.n, len(alphas)
-    z = np.empty((runs, problem.horizon + 1, problem.nz))
-    u = np.empty((runs, problem.horizon, problem.system.m))
-    z[:, 0], u[:] = problem.z_start(), ubar if k is None else ubar + alphas[:, None, None] * k
-    with np.errstate(all="ignore"):
-        for t in range(problem.horizon):
-            if K is not None and zbar is not None:
-                off = wrapped(z[:, t] - zbar[..., t, :], problem.angles)
-                u[:, t] += (K[..., t, :, :] @ off[:, :, None])[:, :, 0]
-            u[:, t] = np.clip(u[:, t], problem.low, problem.high)
-            sent = problem.received(z[:, t], u[:, t], t)
-            z[:, t + 1, :n] = step(z[:, t, :n], sent, t) + problem.bias[..., t, :]
-            z[:, t + 1, n:] = queue.after(z[:, t, n:], u[:, t])
-    return Swarm(z, u, trajectory_cost(problem, z, u))
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,79 +34,6 @@ import numpy as np
 
 SATURATED = 40.0  # logistic(40) = 1 to the last bit
 
-
-def above(eps: float, left: Any, r: Any) -> Any:
-    """Weight of l > r."""
-    if eps == 0.0:
-        return np.greater(left, r).astype(float)
-    with np.errstate(all="ignore"):
-        d = (left - r) / eps
-        w = 1.0 / (1.0 + np.exp(-np.clip(d, -SATURATED, SATURATED)))
-    w = np.where(d > SATURATED, 1.0, np.where(d < -SATURATED, 0.0, w))
-    return np.where(np.isnan(d), np.greater(left, r).astype(float), w)
-
-
-def blend(eps: float, w: Any, a: Any, b: Any) -> Any:
-    """Weighted mean of a and b; the heavier one where the mean is not finite."""
-    with np.errstate(all="ignore"):
-        mixed = w * a + (1.0 - w) * b
-    pure = np.where(np.asarray(w) >= 0.5, a, b)
-    return np.where((w > 0.0) & (w < 1.0) & np.isfinite(mixed), mixed, pure)
-
-
-def absolute(eps: float, x: Any) -> Any:
-    """Smoothed absolute value."""
-    return np.abs(x) if eps == 0.0 else np.sqrt(x * x + eps * eps)
-
-
-def sign(eps: float, x: Any) -> Any:
-    """Smoothed sign; also the derivative of `absolute`."""
-    return np.sign(x) if eps == 0.0 else x / np.sqrt(x * x + eps * eps)
-
-
-def bend(eps: float, x: Any) -> Any:
-    """Derivative of `sign`."""
-    if eps == 0.0:
-        return np.zeros_like(x)
-    q = x * x + eps * eps
-    return eps * eps / (q * np.sqrt(q))
-
-
-def maximum(eps: float, a: Any, b: Any) -> Any:
-    """Smoothed maximum; exact where a bound is infinite."""
-    sharp = np.where(np.greater(a, b), a, b)
-    if eps == 0.0:
-        return sharp
-    d = a - b
-    soft = 0.5 * (a + b + np.sqrt(d * d + eps * eps))
-    return np.where(np.isfinite(soft), soft, sharp)
-
-
-def side(eps: float, a: Any, b: Any) -> Any:
-    """Share of a in the maximum, its derivative with respect to a."""
-    if eps == 0.0:
-        return 0.5 * (1.0 + np.sign(a - b))
-    d = a - b
-    soft = 0.5 * (1.0 + d / np.sqrt(d * d + eps * eps))
-    return np.where(np.isfinite(soft), soft, np.greater(a, b).astype(float))
-
-
-def slope(eps: float, w: Any) -> Any:
-    """Derivative of `above` with respect to l, from its value."""
-    return np.zeros_like(w) if eps == 0.0 else w * (1.0 - w) / eps
-
-
-def gate(eps: float, x: Any, y: Any) -> Any:
-    """The product x y, and 0 where x is 0 or the product is not finite."""
-    product = x * y
-    return np.where((np.asarray(x) != 0.0) & np.isfinite(product), product, 0.0)
-
-
-def equal(eps: float, left: Any, r: Any) -> Any:
-    """1 where equal; never smoothed."""
-    return np.equal(left, r).astype(float)
-
-
 # Operations that are a NumPy function and no more, by their names there.
 PLAIN = {
     **{name: name for name in ("sqrt", "cbrt", "exp", "expm1", "log", "log1p", "sin", "cos")},
@@ -116,22 +43,23 @@ PLAIN = {
 }
 
 
-def _plain(function: Callable[..., Any]) -> Callable[..., Any]:
-    return lambda eps, *args: function(*args)
+def _gated(x: Any, y: Any) -> Any:
+    """The product, and 0 where x is 0 or the product is not finite."""
+    return np.where((x != 0.0) & np.isfinite(x * y), x * y, 0.0)
 
 
-NUMPY: dict[str, Callable[..., Any]] = {
-    **{op: _plain(getattr(np, name)) for op, name in PLAIN.items()},
-    "above": above,
-    "equal": equal,
-    "blend": blend,
-    "abs": absolute,
-    "sign": sign,
-    "max": maximum,
-    "side": side,
-    "bend": bend,
-    "slope": slope,
-    "gate": gate,
+NUMPY: dict[str, Callable[..., Any]] = {  # at eps = 0
+    **{op: getattr(np, name) for op, name in PLAIN.items()},
+    "above": lambda left, r: np.where(left > r, 1.0, 0.0),
+    "equal": lambda left, r: np.where(left == r, 1.0, 0.0),
+    "blend": lambda w, a, b: np.where(w >= 0.5, a, b),
+    "abs": np.abs,
+    "sign": np.sign,
+    "max": lambda a, b: np.where(a > b, a, b),
+    "side": lambda a, b: 0.5 * (1.0 + np.sign(a - b)),
+    "bend": np.zeros_like,
+    "slope": np.zeros_like,
+    "gate": _gated,
 }
 
 MAX_NODES = 50_000
@@ -205,7 +133,7 @@ class Graph:
         values = [self.constant(i) for i in args]
         if all(v is not None for v in values):
             with np.errstate(all="ignore"):
-                result = float(NUMPY[op](0.0, *(np.float64(v) for v in values if v is not None)))
+                result = float(NUMPY[op](*(np.float64(v) for v in values if v is not None)))
             return self.const(result)
         rule = _RULES.get(op)
         return None if rule is None else rule(self, args, values)
@@ -234,26 +162,21 @@ class Graph:
         return text.hexdigest()
 
 
-class Program:
-    """Outputs of a graph, ready to be evaluated with NumPy again and again."""
-
-    def __init__(self, graph: Graph, outputs: Sequence[int]) -> None:
-        self.outputs = list(outputs)
-        self._steps = [(i, graph.nodes[i], graph.varies(i)) for i in graph.live(outputs)]
-
-    def __call__(self, leaves: Mapping[tuple[str, int], Any], eps: float) -> list[Any]:
-        """Values of the outputs: numbers or arrays of samples that broadcast."""
-        values: dict[int, Any] = {}
-        with np.errstate(all="ignore"):
-            for i, node, varies in self._steps:
-                if node.leaf is not None:
-                    values[i] = leaves[node.leaf]
-                elif node.op == "const":
-                    values[i] = np.float64(node.value)
-                else:
-                    width = eps if varies else 0.0
-                    values[i] = NUMPY[node.op](width, *(values[a] for a in node.args))
-        return [values[i] for i in self.outputs]
+def evaluated(
+    graph: Graph, outputs: Sequence[int], leaves: Mapping[tuple[str, int], Any]
+) -> list[Any]:
+    """Values of outputs at eps = 0, by NumPy."""
+    values: dict[int, Any] = {}
+    with np.errstate(all="ignore"):
+        for i in graph.live(outputs):
+            node = graph.nodes[i]
+            if node.leaf is not None:
+                values[i] = np.float64(leaves[node.leaf])
+            elif node.op == "const":
+                values[i] = np.float64(node.value)
+            else:
+                values[i] = NUMPY[node.op](*(values[a] for a in node.args))
+    return [values[i] for i in outputs]
 
 
 def _add(g: Graph, args: tuple[int, ...], v: list[float | None]) -> int | None:

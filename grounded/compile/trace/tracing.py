@@ -20,7 +20,7 @@ from grounded.compile.names import Signature, check_names, raised_at, wrong_valu
 from grounded.compile.trace.derivative import jacobian
 from grounded.compile.trace.expression import Expression, NotTraceable, node_of
 from grounded.compile.trace.functions import rebound
-from grounded.compile.trace.graph import MAX_NODES, Graph, Program, TooLong
+from grounded.compile.trace.graph import MAX_NODES, Graph, TooLong, evaluated
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 
@@ -32,13 +32,36 @@ class Trace:
     graph: Graph
     outputs: tuple[int, ...]  # (n,)
     guards: tuple[tuple[int, bool], ...]
+    sizes: tuple[int, int, int]  # n, m, k
 
     def holds(self, p: Array, dt: float) -> bool:
         """Whether the function would take the same branches with these parameters."""
         if not self.guards:
             return True
-        found = Program(self.graph, [i for i, _ in self.guards])(_uniform(p, dt), 0.0)
+        found = evaluated(self.graph, [i for i, _ in self.guards], _uniform(p, dt))
         return all(bool(v) == outcome for v, (_, outcome) in zip(found, self.guards, strict=True))
+
+    def _variables(self, width: int) -> list[int]:
+        """The leaves of the first `width` of x, u, p."""
+        letters = [(s, i) for s, size in zip("xup", self.sizes, strict=True) for i in range(size)]
+        return [self.graph.leaf(*letter) for letter in letters[:width]]
+
+    def entries(self, width: int) -> list[tuple[int, int, int]]:
+        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p.
+
+        Raises:
+            TooLong: when they are more operations than can be compiled.
+        """
+        variables = self._variables(width)
+        column = {v: c for c, v in enumerate(variables)}
+        rows = jacobian(self.graph, self.outputs, variables)
+        return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
+
+    @property
+    def reads(self) -> NDArray[np.bool_]:
+        """Which of x and u each output depends on, (n, n + m)."""
+        leaves = np.array(self._variables(self.sizes[0] + self.sizes[1]))
+        return np.array([np.isin(leaves, self.graph.live([output])) for output in self.outputs])
 
 
 def trace(signature: Signature, p: Array | None, dt: float) -> Trace | str:
@@ -57,7 +80,7 @@ def trace(signature: Signature, p: Array | None, dt: float) -> Trace | str:
     def oracle(i: int) -> bool:
         if graph.varies(i):
             raise NotTraceable("an `if` (or and, or, while) on a state or an input; use np.where")
-        outcome = True if p is None else bool(Program(graph, [i])(_uniform(p, dt), 0.0)[0])
+        outcome = True if p is None else bool(evaluated(graph, [i], _uniform(p, dt))[0])
         guards.append((i, outcome))
         return outcome
 
@@ -77,7 +100,7 @@ def trace(signature: Signature, p: Array | None, dt: float) -> Trace | str:
         return f"{raised_at(error, signature.function)}: {type(error).__name__}: {error}"
     check_names(values, signature.states, signature.function)
     outputs = tuple(_output(graph, name, values[name], signature) for name in signature.states)
-    return Trace(graph, outputs, tuple(guards))
+    return Trace(graph, outputs, tuple(guards), signature.sizes)
 
 
 def _call(signature: Signature, graph: Graph) -> Mapping[str, Any]:
@@ -100,62 +123,3 @@ def _output(graph: Graph, name: str, value: Any, signature: Signature) -> int:
 
 def _uniform(p: Array, dt: float) -> dict[tuple[str, int], Any]:
     return {("d", 0): dt} | {("p", i): value for i, value in enumerate(p)}
-
-
-class Variant:
-    """One trace as a function of arrays; its derivatives are made when they are asked for."""
-
-    def __init__(self, found: Trace, sizes: tuple[int, int, int]) -> None:
-        self.trace, self.sizes = found, sizes
-        self._known: dict[int, tuple[list[tuple[int, int]], Program]] = {}
-
-    def _variables(self, width: int) -> list[int]:
-        """The leaves of the first `width` of x, u, p."""
-        letters = [(s, i) for s, size in zip("xup", self.sizes, strict=True) for i in range(size)]
-        return [self.trace.graph.leaf(*letter) for letter in letters[:width]]
-
-    def entries(self, width: int) -> list[tuple[int, int, int]]:
-        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p.
-
-        Raises:
-            TooLong: when they are more operations than can be compiled.
-        """
-        variables = self._variables(width)
-        column = {v: c for c, v in enumerate(variables)}
-        rows = jacobian(self.trace.graph, self.trace.outputs, variables)
-        return sorted((r, column[v], i) for r, row in enumerate(rows) for v, i in row.items())
-
-    @property
-    def reads(self) -> NDArray[np.bool_]:
-        """Which of x and u each output depends on, (r, n + m)."""
-        graph, outputs = self.trace.graph, self.trace.outputs
-        leaves = np.array(self._variables(self.sizes[0] + self.sizes[1]))
-        return np.array([np.isin(leaves, graph.live([output])) for output in outputs])
-
-    def values(self, x: Array, u: Array, p: Array, dt: float, smoothing: float) -> Array:
-        """The r outputs at N samples x (N, n), u (N, m): (N, r)."""
-        return self.linearised(x, u, p, dt, smoothing, 0)[0]
-
-    def linearised(
-        self, x: Array, u: Array, p: Array, dt: float, smoothing: float, width: int
-    ) -> tuple[Array, Array]:
-        """The outputs (N, r), and their Jacobian by the first `width` of x, u, p (N, r, width).
-
-        Raises:
-            TooLong: see `entries`.
-        """
-        outputs = self.trace.outputs
-        if width not in self._known:
-            entries = self.entries(width) if width else []
-            program = Program(self.trace.graph, [*outputs, *(i for _, _, i in entries)])
-            self._known[width] = [(r, c) for r, c, _ in entries], program
-        places, program = self._known[width]
-        leaves = _uniform(p, dt) | {("x", i): column for i, column in enumerate(x.T)}
-        leaves |= {("u", j): column for j, column in enumerate(u.T)}
-        numbers = program(leaves, smoothing)
-        values, J = np.empty((len(x), len(outputs))), np.zeros((len(x), len(outputs), width))
-        for r in range(len(outputs)):
-            values[:, r] = numbers[r]
-        for (r, c), number in zip(places, numbers[len(outputs) :], strict=True):
-            J[:, r, c] = number
-        return values, J

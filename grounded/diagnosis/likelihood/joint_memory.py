@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.compile import System, system_of
+from grounded.compile import system_of
+from grounded.compile.run.interpreted import System
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Effect, LossFamily
 from grounded.effects.drive import push, speed

@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from grounded.compile import Named, System, system_of
+from grounded.compile import Named, system_of
+from grounded.compile.run.interpreted import System
 from grounded.diagnosis.likelihood.arriving import delayed
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.diagnosis.likelihood.joint_memory import remembering
