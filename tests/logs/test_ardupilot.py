@@ -41,7 +41,7 @@ def test_messages_are_topics_with_the_units_that_the_log_states(log: Path) -> No
     np.testing.assert_allclose(found["roll"].values, ROLL, atol=0.0051)
     np.testing.assert_allclose(found["roll"].t, 1e9 + T * 1e9, atol=1000)
     np.testing.assert_allclose(found["p"].values, GYRO + 1, rtol=1e-6, atol=1e-6)
-    units = inspect_log(log).stated.heads
+    units = inspect_log(log).about[0].units
     assert units["/ATT.Roll"] == "deg" and units["/IMU.GyrX"] == units["/IMU_1.GyrX"] == "rad/s"
     assert {topic.topic for topic in inspect_log(log).topics} >= {"/ATT", "/IMU", "/IMU_1"}
 

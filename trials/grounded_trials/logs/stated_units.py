@@ -1,22 +1,16 @@
-"""Units of a log's numbers, stated or by ROS conventions, compared with those of the model.
+"""Units of a log's numbers: as names state them, or by the conventions of ROS.
 
-A unit in brackets in a CSV's first row, such as `x [mm]`, is certain, and one at the end of a name
-nearly so. If it is a multiple of the model's unit, [log] gets the factor between the two. Units
-that are not multiples of each other are ignored.
-
-The fields of ROS messages have fixed units (REP 103: metres, radians, seconds). A JointState's
-position is in radians for a revolute and in metres for a prismatic joint, which the joint's name
-may show: `joint_units` in `inspection`. A field `angle` is an angle in any message, though
-perhaps not in radians; it is not a length.
+A unit at the end of a name is nearly certain. If it is a multiple of the model's unit, [log] gets
+the factor between the two. The fields of ROS messages have fixed units (REP 103: metres, radians,
+seconds); those of joints follow from their names: `joint_units` in `inspection`. A field `angle` is
+an angle in any message, though perhaps not in radians; it is not a length.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
 
-from grounded.units import ENDINGS, factor_between, unit_ending
+from grounded.units import ENDINGS, unit_ending
 
 _ROLES = re.compile(  # suffixes that mark a command; its unit may come before or after them
     r"_(?:cmd|command|commanded|ref|reference|target|setpoint|sp|desired|des|goal|request|req|ctrl)$"
@@ -35,35 +29,15 @@ UNITS = (  # units by the end of a path
     (r"/[^/.]*gyro\.[xyz]$|gyro_rad\[\d\]$|angular_velocity\.xyz\[\d\]$", "rad/s"),
     (r"/[^/.]*mag(netometer)?\.(\w+\[\d\]|[xyz])$|magnetometer_ga\[\d\]$", "T"),
     (r"linear\.[xyz]$|@world_velocity\.[xyz]$|drive\.speed$", "m/s"),
+    *((rf"\.{kind}\[\d+\]$", unit) for kind, unit in TURNING.items()),
 )
 ANGLE = re.compile(r"(^|[._/])(angle|angular_position|swing|tilt|pitch|roll|yaw|heading)$")
 LENGTHS = ("m", "m/s")
 
 
-@dataclass(frozen=True)
-class Stated:
-    """The units that a log states: in a table's first row, or at the end of names."""
-
-    heads: Mapping[str, str]  # as read, by message path
-
-    def unit(self, path: str) -> str:
-        """Return the unit of a number, "" if none is stated."""
-        return self.heads.get(path) or unit_in_name(path)
-
-    def factor(self, path: str, wanted: str) -> float:
-        """Return the factor from the log's unit to the model's; 1 if no unit is stated."""
-        found = factor_between(said, wanted) if (said := self.unit(path)) else None
-        return 1.0 if found is None else found
-
-
 def unit_in_name(path: str) -> str:
     """Return the unit at the end of a message path's last name, as in `/csv.x_mm`; "" for none."""
     return ENDINGS.get(_parts(path)[1] or _parts(without_role(path))[1], "")
-
-
-def command_unit(name: str, path: str, stated: Stated) -> str:
-    """Return the unit of a command: the one that the log states, else "1", or V of a voltage."""
-    return stated.unit(path) or ("V" if "volt" in name.lower() else "1")
 
 
 def without_unit(path: str) -> str:
@@ -91,15 +65,9 @@ def _parts(path: str) -> tuple[str, str]:
     return (whole[: -len(ending) - 1], ending) if ending else (path, "")
 
 
-def unit_of(path: str, joints: Mapping[str, str] | None = None) -> str:
+def unit_of(path: str) -> str:
     """Return the unit of a path's number by convention, "" if there is none."""
-    if joints and path in joints:
-        return joints[path]
-    for pattern, unit in UNITS:
-        if re.search(pattern, path):
-            return unit
-    found = re.search(r"\.(position|velocity|effort)\[\d+\]$", path)
-    return TURNING[found[1]] if found else ""
+    return next((unit for pattern, unit in UNITS if re.search(pattern, path)), "")
 
 
 def is_angle(path: str) -> bool:

@@ -11,7 +11,6 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, TypedDict
 
 import numpy as np
@@ -27,7 +26,6 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.inspection.assignment import assigned
 from grounded_trials.logs.inspection.guess import Guess, mapping_toml
 from grounded_trials.logs.inspection.inspect_log import LogReport, inspect_log
-from grounded_trials.logs.inspection.joint_names import joint_names
 from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.log_paths import log_files
 from grounded_trials.logs.log_table import log_mapping, read_log
@@ -38,11 +36,10 @@ from grounded_trials.starting.kinds import (
     KINDS,
     Clues,
     kind_in,
-    moving,
     skeleton,
     with_gain,
 )
-from grounded_trials.starting.own_model import OwnModel, own_model
+from grounded_trials.starting.own_model import own_model
 from grounded_trials.starting.skeletons import Skeleton
 from grounded_trials.store.own_files import format_of
 from grounded_trials.store.store import write_atomically
@@ -161,19 +158,26 @@ def begin(
     with fresh_folder(folder, files):
         # What the log has, and the model: the user's, or a skeleton of the kind of robot.
         logs, report, notes = _usable(log, layout)
-        clues = Clues(report, joint_names(report))
-        drawn = _Draft(folder, clues, own, inputs)
-        drawn.begin("generic" if inputs else kind or "")
+        clues = Clues(report)
+        if own:
+            made, plain, drawn, why = own.bring(folder), None, "", "your model"
+            found: Guesses = assigned(report, made.states, made.inputs, made)
+        else:
+            asked = "generic" if inputs else kind or ""
+            drawn, why, plain, made, found = _skeleton(folder, clues, asked, inputs)
+            notes += _of_generic(made, clues) if drawn == "generic" else ()
 
         # Which number is which signal, and in which units.
-        units = {**drawn.model.states, **drawn.model.inputs}
-        states, commands = ([_asked(g, ask, report, units) for g in some] for some in drawn.matched)
-        drawn.with_gain((*states, *commands))
+        units = {**made.states, **made.inputs}
+        states, commands = ([_asked(g, ask, report, units) for g in some] for some in found)
+        signals = {g.name: g for g in (*states, *commands)}
+        if plain is not None and (full := with_gain(plain, signals, report)) is not plain:
+            made = _written(folder, full)
 
         # The control interval, and the ranges: zero is sent after a run, so limits must include it.
         step = dt or _interval_of(report, commands, states)
-        made = own.in_step(folder, drawn.model, step) if own else drawn.model
-        ranges = {g.name: g.extent for g in (*states, *commands)}
+        made = own.in_step(folder, made, step) if own else made
+        ranges = {name: g.extent for name, g in signals.items()}
         for g in commands:
             if (seen := ranges[g.name]) is not None:
                 ranges[g.name] = min(seen[0], 0.0), max(seen[1], 0.0)
@@ -181,88 +185,63 @@ def begin(
         # The files: the target is read from the log as its [log] table says.
         table = mapping_toml(states, commands, simulated=report.simulated, layout=layout)
         columns, sent, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
-        horizon = len(next(iter(columns.values()))) - 1
-        name, why = Path(log).name, drawn.why
+        horizon, name = len(next(iter(columns.values()))) - 1, Path(log).name
         stood = held_first(made, columns, sent, step)
         write_first(folder, made, step, columns, horizon, ranges, table, why, name, stood)
         more = [*_on_own(report, (*states, *commands), made)] if own else []
         return Begun(
             workspace=str(folder),
             log=str(log),
-            kind="" if own else drawn.kind,
+            kind=drawn,
             why=why,
             dt=step,
             horizon=horizon,
             states=tuple(states),
             inputs=tuple(commands),
             target=f"{horizon * step:.3g} s of the log" if sent else "zeros",
-            findings=(*notes, *drawn.notes, *more, *odd_run),
+            findings=(*notes, *more, *odd_run),
         )
 
 
-@dataclass(eq=False)
-class _Draft:
-    """The model of a new workspace, and the numbers that its signals are taken from."""
+Guesses = tuple[Sequence[Guess], Sequence[Guess]]  # of the states, of the inputs
 
-    folder: Path
-    clues: Clues
-    own: OwnModel | None
-    named: Sequence[str]  # inputs of a generic skeleton
-    kind: str = ""
-    why: str = ""
-    plain: Skeleton | None = None
-    model: Model = field(init=False)
-    matched: tuple[Sequence[Guess], Sequence[Guess]] = ((), ())  # states, inputs
-    notes: tuple[Finding, ...] = ()
 
-    def begin(self, kind: str) -> None:
-        """Take the user's model, or a skeleton: the kind's if it has a state of the log."""
-        self.kind, self.why = (kind, "--kind") if kind else kind_in(self.clues)
-        if self.own:
-            self.model, self.why = self.own.bring(self.folder), "your model"
-            self._match()
-            return
-        self._take(skeleton(self.kind, self.clues, self.named))
-        if not (kind or any(g.path for g in self.matched[0])):
-            self.kind, self.why = "generic", f"none of {self.kind}"
-            self._take(skeleton("generic", self.clues, self.named))
+def _skeleton(
+    folder: Path, clues: Clues, asked: str, named: Sequence[str]
+) -> tuple[str, str, Skeleton, Model, Guesses]:
+    """Write the skeleton of a kind, of the generic one if a guessed kind has no state of the log.
 
-    def with_gain(self, signals: Sequence[Guess]) -> None:
-        """Write the gain that the log shows into a skeleton that has one."""
-        if self.plain is not None:
-            full = with_gain(self.plain, {g.name: g for g in signals}, self.clues.log)
-            if full is not self.plain:
-                self._write(full)
+    Returns:
+        The kind and why, the skeleton, its model, and the numbers that its signals are taken from.
+    """
+    kind, why = (asked, "--kind") if asked else kind_in(clues)
+    while True:
+        plain = skeleton(kind, clues, named)
+        model, generic = _written(folder, plain), kind == "generic"
+        given = {name: one.path for name, one in clues.found.items()} if generic else {}
+        found = assigned(clues.log, model.states, model.inputs, model, given)
+        if asked or generic or any(g.path for g in found[0]):
+            guessed = generic and not named
+            why += f"; inputs guessed, as by --inputs {','.join(model.inputs)}" * guessed
+            return kind, why, plain, model, found
+        kind, why = "generic", f"none of {kind}"
 
-    def _take(self, plain: Skeleton) -> None:
-        self._write(plain)
-        numbers = self.clues.found
-        if self.kind != "generic":
-            self._match()
-            return
-        self._match({name: one.path for name, one in numbers.items()})
-        if not self.named:
-            self.why += f"; inputs guessed, as by --inputs {','.join(self.model.inputs)}"
-        left = [n for n in numbers if n not in {**self.model.states, **self.model.inputs}]
-        odd = [found("start.unused", *left)] * bool(left)
-        if not set(self.model.inputs) & set(numbers):
-            odd.append(found("given.no_input", "--inputs", what="command", weight=Weight.NOTE))
-        gains = (one for name, one in self.model.params.items() if name.startswith("gain_"))
-        if not any(one.value for one in gains):
-            odd.append(found("plan.without_effect", *self.model.input_names, file="model.py"))
-        self.notes = tuple(odd)
 
-    def _match(self, given: Mapping[str, str] = MappingProxyType({})) -> None:
-        model = self.model
-        self.matched = assigned(
-            self.clues.log, model.states, model.inputs, model, self.clues.joints, given
-        )
+def _of_generic(model: Model, clues: Clues) -> tuple[Finding, ...]:
+    """Return what a generic skeleton leaves out of the log, and what it does not know."""
+    left = [n for n in clues.found if n not in {**model.states, **model.inputs}]
+    odd = [found("start.unused", *left)] * bool(left)
+    if not set(model.inputs) & set(clues.found):
+        odd.append(found("given.no_input", "--inputs", what="command", weight=Weight.NOTE))
+    if not any(p.value for name, p in model.params.items() if name.startswith("gain_")):
+        odd.append(found("plan.without_effect", *model.input_names, file="model.py"))
+    return tuple(odd)
 
-    def _write(self, plain: Skeleton) -> None:
-        """Write a skeleton as model.py and load it."""
-        self.plain = plain
-        write_atomically(self.folder / "model.py", plain.source().encode())
-        self.model = model_in(load_module(self.folder, "model.py"))
+
+def _written(folder: Path, plain: Skeleton) -> Model:
+    """Write a skeleton as model.py and load it."""
+    write_atomically(folder / "model.py", plain.source().encode())
+    return model_in(load_module(folder, "model.py"))
 
 
 def _usable(
@@ -298,8 +277,7 @@ def _one_run(report: LogReport) -> tuple[LogReport, tuple[Finding, ...]]:
 def _on_own(report: LogReport, guesses: Sequence[Guess], model: Model) -> Iterator[Finding]:
     """Yield what the user's own model and the log lack of each other."""
     used = {guess.path for guess in guesses}
-    left = [f.path for f in moving(report).values() if f.path not in used]
-    if left := [path for path in left if not PARTS.search(path)]:
+    if left := [path for path in report.moving if not (path in used or PARTS.search(path))]:
         more = [f"{len(left) - NAMED} more"] * (len(left) > NAMED)
         yield found("start.unused", *left[:NAMED], *more)
     if (name := heading(model)) and name not in model.angles:
@@ -340,7 +318,7 @@ def _asked(guess: Guess, ask: Ask | None, report: LogReport, units: Mapping[str,
     path = ask(guess)
     if path == guess.path:
         return replace(guess, sure=bool(path))
-    scale = report.stated.factor(path, units[guess.name]) if path else 1.0
+    scale = report.factor(path, units[guess.name]) if path else 1.0
     why = (found("start.given", guess.name),)
     field, clock = report.number(path), report.clock(report.topic_of(path))
     return Guess(guess.name, path, clock, bool(path), guess.others, field, why, scale)

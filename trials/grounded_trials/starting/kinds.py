@@ -14,19 +14,16 @@ import re
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from grounded.checks import refused, unknown
 from grounded.units import factor_between
 from grounded_trials.logs.inspection.guess import Guess
 from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport
-from grounded_trials.logs.inspection.joint_names import at_joints, from_base, slides
+from grounded_trials.logs.inspection.joint_names import from_base, joint_names, part_of, slides
 from grounded_trials.logs.inspection.names import PARTS
 from grounded_trials.logs.inspection.relations import Signals
-from grounded_trials.logs.stated_units import Stated, bare_command, command_unit
+from grounded_trials.logs.stated_units import bare_command
 from grounded_trials.starting.skeletons import Skeleton, arm, driven_by, drone, fixed
 
-Joints = Mapping[str, tuple[str, ...]]  # joint names by topic, see `joint_names`
 HELD = 0.3  # share of samples equal to the previous one, above which a number is a command
 MOST_STATES, MOST_INPUTS = 6, 4  # largest number of states and of guessed inputs of a generic model
 SIDES = re.compile(r"^(left|right|u\d*|u_\w+)$")  # names of inputs, in addition to COMMANDED
@@ -79,20 +76,27 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     Raises:
         GroundedError: for an input that the log does not have.
     """
-    log, found = clues.log, clues.found
-    unit = {n: clues.stated.unit(f.path) or "1" for n, f in found.items()}
+    log, found, called = clues.log, clues.found, [*clues.sent]
+    unit = {n: log.unit(f.path) or "1" for n, f in found.items()}
     for name in (one for one in inputs if one not in found):
         if any(_word(one.path) == name for one in log.numbers):
             raise refused("start.still", name)
         raise unknown("number", name, found, "the log")
-    called = [*clues.sent]
+
+    # The inputs: as given, the commands of states, what is named like a command, what is held.
     followers = _followers(found, list(inputs) or called)
-    guessed = list(followers.values())[:MOST_STATES] or (called or _held_in(found))[:MOST_INPUTS]
+    held = [name for name, one in found.items() if one.held > HELD]
+    held = held if 2 * len(held) < len(found) else []
+    guessed = list(followers.values())[:MOST_STATES] or (called or held)[:MOST_INPUTS]
     inputs = inputs or guessed or ["u"]
 
     # The states, and those whose rate is another one.
     states = [name for name in found if name not in inputs][:MOST_STATES] or ["x"]
-    rates = _rates(log, {name: found[name].path for name in states if name in found})
+    names = {found[name].path: name for name in states if name in found}
+    rates = {
+        names[position]: f"{times:g} * " * (times != 1) + f"s.{names[rate]}"
+        for position, (rate, times) in Signals(log).rates(list(names)).items()
+    }
 
     # The equations of the others: each lags behind its own command, or behind all inputs.
     equations, lags, gains = [], dict[str, str](), dict[str, str]()
@@ -100,9 +104,8 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
         if s in rates:
             equations.append(f'"{s}": {rates[s]}')
             continue
-        own = (
-            {followers[s]: f"gain_{s}"} if s in followers else {i: f"gain_{s}_{i}" for i in inputs}
-        )
+        own = {i: f"gain_{s}_{i}" for i in inputs}
+        own = {followers[s]: f"gain_{s}"} if s in followers else own
         sums = " + ".join(f"p.{gain} * a.{i}" for i, gain in own.items())
         equations.append(f'"{s}": ({sums} - s.{s}) / p.tau_{s}')
         lags[f"tau_{s}"] = '1.0, "s", 0.01, 100.0'
@@ -118,12 +121,6 @@ def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
         equations,
         tuple(s for s in states if unit.get(s) == "rad" and _turns(found[s])),
     )
-
-
-def _held_in(found: Mapping[str, FieldReport]) -> list[str]:
-    """Return the numbers that are held over several samples, if most are not."""
-    held = [name for name, one in found.items() if one.held > HELD]
-    return held if 2 * len(held) < len(found) else []
 
 
 def _turns(number: FieldReport) -> bool:
@@ -142,42 +139,36 @@ def _followers(found: Mapping[str, FieldReport], inputs: Sequence[str]) -> dict[
     return followed if len(followed) == len(inputs) else {}
 
 
-def _rates(log: LogReport, paths: Mapping[str, str]) -> dict[str, str]:
-    """Return for each position, by name, its rate as an expression of another number of the log."""
-    names = {path: name for name, path in paths.items()}
-    signals = Signals(log)
-    return {
-        names[position]: f"{times:g} * " * (times != 1) + f"s.{names[rate]}"
-        for position, (rate, times) in signals.rates(list(names)).items()
-    }
-
-
 def _in_group(path: str) -> str:
     """Return the end of a message path with the name before it, as a Python name: linear_x."""
-    last = re.sub(r"\W+", "_", ".".join(path.rsplit(".", 2)[-2:])).strip("_")
-    return last if last.isidentifier() else f"s_{last}"
+    return _python(".".join(path.rsplit(".", 2)[-2:]))
 
 
 def _word(path: str) -> str:
     """Return the end of a message path as a Python name."""
     last = path.replace("@", "").rsplit(".", 1)[-1].strip('"')
-    name = last if last not in ("data", "value") else path.rsplit(".", 1)[0].rsplit("/", 1)[-1]
-    name = re.sub(r"\W+", "_", name).strip("_")
+    return _python(path.rsplit(".", 1)[0].rsplit("/", 1)[-1] if last in ("data", "value") else last)
+
+
+def _python(text: str) -> str:
+    name = re.sub(r"\W+", "_", text).strip("_")
     return name if name.isidentifier() else f"s_{name}"
 
 
 class Clues:
     """What in a log shows the kind of robot."""
 
-    def __init__(self, log: LogReport, joints: Joints) -> None:
-        self.log, self.joints, self.stated = log, joints, log.stated
-        self.found = moving(log)
+    def __init__(self, log: LogReport) -> None:
+        self.log, self.found, self.joints = log, moving(log), joint_names(log)
         self.sent = {  # the paths of the numbers that are named like commands
             name: one.path
             for name, one in self.found.items()
             if called_input(name, one.path, self.found)
         }
-        self.headed = any(HEADING.search(path.lower()) for path in log.moving)
+        # the joints that are not all wheels
+        self.arms = {
+            t: n for t, n in self.joints.items() if not all("wheel" in j.lower() for j in n)
+        }
 
     def topic(self, pattern: str | re.Pattern[str], *, fields: bool = False) -> str:
         """Return the first topic named like that, or with such a field; "" for none."""
@@ -192,22 +183,18 @@ class Clues:
         """The topic of a car's commands in ROS."""
         return next((t.topic for t in self.log.topics if "Ackermann" in t.type), "")
 
-    @property
-    def arms(self) -> Joints:
-        """The topics whose joints are not all wheels."""
-        return {t: n for t, n in self.joints.items() if not all("wheel" in j.lower() for j in n)}
-
     def turning(self, several: bool) -> str:
         """Return the joints that turn, several of an arm or the one of a pendulum."""
-        arms = {t: n for t, n in at_joints(self.arms).items() if not all(map(slides, n))}
+        arms = {t: n for t, n in self.arms.items() if not (part_of(t) or all(map(slides, n)))}
         where, names = next(iter(arms.items()), ("", ()))
         return f"{where}: {', '.join(names[:6])}" if where and several == (len(names) > 1) else ""
 
     @property
     def sides(self) -> tuple[str, ...]:
         """The names of a left and a right command; () without both, or without a heading."""
-        paths = {*self.log.moving} if self.headed else set[str]()
-        for left in sorted(paths):
+        paths = {*self.log.moving}
+        headed = any(HEADING.search(path.lower()) for path in paths)
+        for left in sorted(paths) if headed else ():
             right = re.sub("left|Left|LEFT", lambda m: OTHER[m[0]], left)
             if right != left and right in paths and _word(left) != _word(right):
                 return _word(left), _word(right)
@@ -264,7 +251,7 @@ def skeleton(kind: str, clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
     if kind == "car" and not clues.ackermann:
         return _car(clues)
     if kind == "rover":
-        return pushed(plain, clues.sent, clues.stated)
+        return pushed(plain, clues)
     if kind in ("differential", "boat"):
         sides = zip(plain.inputs, clues.sides, strict=False)
         return driven_by(plain, {old: (name, "1") for old, name in sides})
@@ -275,65 +262,52 @@ def _drone(clues: Clues) -> Skeleton:
     """Return the drone's skeleton: its yaw is a constant if the log's hardly changes."""
     topics = clues.log.topics
     commands = [t for t in topics if COMMANDED.search(t.topic.lower())]
-    yaws = [(t, f) for t in topics for f in t.fields if f.path.endswith("@rpy.yaw")]
-    own = next((f for t, f in yaws if t not in commands), None)
-    sent = any(t in commands and f.low != f.high for t, f in yaws)
-    rates = any("angular.z" in f.path.lower() for t in commands for f in t.fields)
-    command = "yaw_command" if sent else "yaw_rate" if rates else ""
+    yaws = [(t in commands, f) for t in topics for f in t.fields if f.path.endswith("@rpy.yaw")]
+    own = next((f for sent, f in yaws if not sent), None)
     low, high = (own.low or 0.0, own.high or 0.0) if own else (0.0, 0.0)
-    return drone(low, high, command)
+    rates = any("angular.z" in f.path.lower() for t in commands for f in t.fields)
+    command = "yaw_command" if any(sent and f.low != f.high for sent, f in yaws) else ""
+    return drone(low, high, command or "yaw_rate" * rates)
 
 
 def _car(clues: Clues) -> Skeleton:
     """Return the car skeleton, driven by the log's own command, steered by an angle or a lock."""
     steered = (one.path for one in clues.log.numbers if "steer" in _word(one.path).lower())
-    said = {clues.stated.unit(path) for path in steered} - {""}
+    said = {clues.log.unit(path) for path in steered} - {""}
     angle, part = (any(factor_between(u, of) is not None for u in said) for of in ("rad", "1"))
     throttle = clues.topic("throttle", fields=True)
     plain = fixed("car" if angle or not (throttle or part) else "car_lock")
-    if throttle:
-        return pushed_by(plain, "throttle", "1")
-    return pushed(plain, clues.sent, clues.stated)
+    return _pushed_by(plain, "throttle", "1") if throttle else pushed(plain, clues)
 
 
-def pushed(plain: Skeleton, sent: Mapping[str, str], stated: Stated) -> Skeleton:
+def pushed(plain: Skeleton, clues: Clues) -> Skeleton:
     """Return a skeleton driven by the log's only motor command, if that has no speed command."""
-    if any(SPEED.search(path.lower()) for path in sent.values()):
-        return plain
-    motors = {name: path for name, path in sent.items() if MOTOR.search(path.lower())}
-    if len(motors) != 1:
+    motors = {name: path for name, path in clues.sent.items() if MOTOR.search(path.lower())}
+    if len(motors) != 1 or any(SPEED.search(path.lower()) for path in clues.sent.values()):
         return plain
     ((name, path),) = motors.items()
-    return pushed_by(plain, name, command_unit(name, path, stated))
+    return _pushed_by(plain, name, clues.log.unit(path) or ("V" if "volt" in name.lower() else "1"))
 
 
-def pushed_by(plain: Skeleton, command: str, unit: str) -> Skeleton:
+def _pushed_by(plain: Skeleton, command: str, unit: str) -> Skeleton:
     """Return a skeleton with a command in place of `speed`; for its gain see `with_gain`."""
     per = "m/s" if unit == "1" else f"m/s/({unit})" if " " in unit else f"m/s/{unit}"
     return driven_by(plain, {"speed": (command, unit)}, gain=f'1.0, "{per}", 0.2, 5.0')
 
 
 def with_gain(plain: Skeleton, found: Mapping[str, Guess], log: LogReport) -> Skeleton:
-    """Return such a skeleton with the gain that the log shows; others unchanged."""
-    told = plain.params.get("gain", "").split('"')
-    v, drive = found.get("v"), next((n for n in plain.inputs if f"p.gain * a.{n}" in _v(plain)), "")
-    u = found.get(drive)
-    if drive in ("", "speed") or v is None or u is None or not (v.path and u.path):
+    """Return such a skeleton with the gain of the log, by least squares; others as given."""
+    speed = next((line for line in plain.lines if line.startswith('"v":')), "")
+    drive = next((n for n in plain.inputs if f"p.gain * a.{n}" in speed and n != "speed"), "")
+    v, u = found.get("v"), found.get(drive)
+    gridded = Signals(log).grid((v.path, u.path)) if v and u and v.path and u.path else None
+    if gridded is None or v is None or u is None:
         return plain
-    if not (seen := _gain(v, u, log)):
+    moved, sent = v.scale * gridded[1][0], u.scale * gridded[1][1]
+    seen = float(moved @ sent) / max(float(sent @ sent), 1e-12)
+    unit = plain.params["gain"].split('"')[1]
+    if not seen:
         return plain
     low, high = sorted((seen / GAIN_RANGE, seen * GAIN_RANGE))
-    text = f'{seen:.3g}, "{told[1]}", {low:.2g}, {high:.2g}'
-    return replace(plain, params={**plain.params, "gain": text})
-
-
-def _v(plain: Skeleton) -> str:
-    return next((line for line in plain.lines if line.startswith('"v":')), "")
-
-
-def _gain(v: Guess, u: Guess, log: LogReport) -> float:
-    """Return the speed per unit of command, by least squares; 0 if unknown."""
-    gridded = Signals(log).grid((v.path, u.path))
-    speed, command = (np.zeros(1), np.zeros(1)) if gridded is None else gridded[1]
-    command = u.scale * command
-    return float(v.scale * speed @ command) / max(float(command @ command), 1e-12)
+    gain = f'{seen:.3g}, "{unit}", {low:.2g}, {high:.2g}'
+    return replace(plain, params={**plain.params, "gain": gain})

@@ -13,6 +13,33 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+SOURCE = '''"""{text}.
+
+A skeleton written by `grounded init --from`: change it to match your robot.
+"""
+
+{numpy}from grounded import Model, Param
+
+
+def dynamics(s, a, p):
+    """ds/dt."""
+{before}    return {{
+{lines}    }}
+
+
+# Param(value, unit) is a constant; `fit` may change one that has bounds.
+model = Model(
+    name="{kind}",
+    states={states},
+    inputs={inputs},
+    params={{
+{params}    }},
+    angles={angles!r},
+    roles={roles!r},
+    derivative=dynamics,
+)
+'''
+
 
 @dataclass(frozen=True)
 class Skeleton:
@@ -30,45 +57,19 @@ class Skeleton:
 
     def source(self) -> str:
         """Return the text of model.py."""
-        params = [f'        "{name}": Param({given}),' for name, given in self.params.items()]
-        return "\n".join(
-            [
-                f'"""{self.text}.',
-                "",
-                "A skeleton written by `grounded init --from`: change it to match your robot.",
-                '"""',
-                "",
-                "import numpy as np",
-                "",
-                "from grounded import Model, Param",
-                "",
-                "",
-                "def dynamics(s, a, p):",
-                '    """ds/dt."""',
-                *(f"    {line}" for line in self.before),
-                "    return {",
-                *(f"        {line}," for line in self.lines),
-                "    }",
-                "",
-                "",
-                "# Param(value, unit) is a constant; `fit` may change one that has bounds.",
-                "model = Model(",
-                f'    name="{self.kind}",',
-                f"    states={_dict(self.states)},",
-                f"    inputs={_dict(self.inputs)},",
-                "    params={",
-                *params,
-                "    },",
-                f"    angles={self.angles!r},",
-                f"    roles={dict(self.roles)!r},",
-                "    derivative=dynamics,",
-                ")",
-                "",
-            ]
-        ).replace("import numpy as np\n\n", "import numpy as np\n\n" if self._numpy() else "")
-
-    def _numpy(self) -> bool:
-        return any("np." in line for line in (*self.lines, *self.before))
+        uses = any("np." in line for line in (*self.lines, *self.before))
+        return SOURCE.format(
+            text=self.text,
+            numpy="import numpy as np\n\n" * uses,
+            before="".join(f"    {line}\n" for line in self.before),
+            lines="".join(f"        {line},\n" for line in self.lines),
+            kind=self.kind,
+            states=_dict(self.states),
+            inputs=_dict(self.inputs),
+            params="".join(f'        "{n}": Param({given}),\n' for n, given in self.params.items()),
+            angles=self.angles,
+            roles=dict(self.roles),
+        )
 
 
 def _dict(units: Mapping[str, str]) -> str:
@@ -105,13 +106,7 @@ def _tables() -> dict[str, Any]:
 
 
 def driven_by(plain: Skeleton, commands: Mapping[str, tuple[str, str]], **params: str) -> Skeleton:
-    """Return a skeleton with other inputs.
-
-    Args:
-        plain: a skeleton.
-        commands: name and unit of the input that takes the place of each, by the old name.
-        params: parameters that change with them.
-    """
+    """Return a skeleton with other inputs, name and unit by the old name, and parameters."""
     new = {old: (old, unit) for old, unit in plain.inputs.items()} | dict(commands)
 
     def written(lines: Sequence[str]) -> list[str]:
@@ -127,12 +122,9 @@ def driven_by(plain: Skeleton, commands: Mapping[str, tuple[str, str]], **params
 
 
 def drone(low: float, high: float, command: str) -> Skeleton:
-    """Return the drone's skeleton for the yaw of a log.
+    """Return the drone's skeleton for the yaw of a log, from low to high [rad].
 
-    Args:
-        low: smallest yaw in the log [rad].
-        high: largest yaw in the log [rad].
-        command: what the log has as its command: `yaw_command` [rad], `yaw_rate` [rad/s] or "".
+    `command` is what the log has: `yaw_command` [rad], `yaw_rate` [rad/s] or "".
     """
     if high - low >= STEADY:
         return fixed(f"drone_{command or 'yaw_rate'}")

@@ -32,6 +32,7 @@ from grounded_trials.logs.inspection.inspect_log import FieldReport, LogReport, 
 from grounded_trials.logs.inspection.joint_names import (
     NAMED,
     Joint,
+    Joints,
     in_order,
     joint_names,
     joint_units,
@@ -46,12 +47,7 @@ from grounded_trials.logs.inspection.relations import (
     Signals,
     follows,
 )
-from grounded_trials.logs.stated_units import (
-    LENGTHS,
-    is_angle,
-    unit_of,
-    without_role,
-)
+from grounded_trials.logs.stated_units import LENGTHS, is_angle, unit_of, without_role
 
 POINTS_TO_PROPOSE = 2.0  # points from which a number is proposed whatever else there is
 SURE_LEAD = 1.5  # lead over the next number, to be sure
@@ -59,14 +55,7 @@ LEAD = 0.75  # lead of a number without a name over those that fit worse
 MOST_CANDIDATES = 20  # largest number of candidates
 UNNAMED = 60  # most numbers without a name that are tried as rates
 LATEST = 0.5  # [s] a command is sought up to this long before the angle that follows it
-STATED, CAP = 1.8, 5.0  # points, see `_Table`
-
-
-@dataclass(frozen=True)
-class _Role:
-    name: str
-    unit: str
-    sent: bool  # an input
+STATED, CAP = 1.8, 5.0  # points of a unit that the log states; most of a relation
 
 
 @dataclass(frozen=True)
@@ -85,9 +74,10 @@ class _Number:
     @property
     def measured(self) -> bool:
         """Whether it is a joint's position or speed, a pose or odometry: no command."""
-        kind, away = self.topic.type, not self.command
+        kind = self.topic.type
         joint = kind.endswith("/JointState") and ".effort[" not in self.path
-        return (away and (joint or kind.endswith(words.POSES))) or kind.endswith(words.MEASURED)
+        away = not self.command and (joint or kind.endswith(words.POSES))
+        return away or kind.endswith(words.MEASURED)
 
 
 def assigned(
@@ -95,7 +85,6 @@ def assigned(
     states: Mapping[str, str],
     inputs: Mapping[str, str],
     model: Model | None = None,
-    joints: Mapping[str, tuple[str, ...]] | None = None,
     given: Mapping[str, str] = MappingProxyType({}),
 ) -> tuple[tuple[Guess, ...], tuple[Guess, ...]]:
     """Return guesses for the states and for the inputs, in their order.
@@ -105,10 +94,9 @@ def assigned(
         states: units of the states by name, "" where unknown.
         inputs: units of the inputs by name.
         model: whose equations relate them; None: names and units alone decide.
-        joints: the result of `joint_names`, if already known.
         given: numbers after which some states and inputs are named.
     """
-    table = _Table(log, states, inputs, joint_names(log) if joints is None else joints, model)
+    table = _Table(log, states, inputs, model)
     for name, path in ((n, p) for n, p in given.items() if n in table.row):
         table.add(name, path, 2 * CAP)
         table.named.add((name, path))
@@ -128,24 +116,21 @@ class _Table:
         log: LogReport,
         states: Mapping[str, str],
         inputs: Mapping[str, str],
-        joints: Mapping[str, tuple[str, ...]],
         model: Model | None,
     ) -> None:
-        self.log, self.joints, self.stated = log, joints, log.stated
-        self.model, own = model, {*states, *inputs}
-        rates = rate_states(model) if model is not None else {}
-        self.rates = {q: w for q, w in rates.items() if {q, w} <= own}
+        self.log, self.model, self.inputs = log, model, inputs
         self.units = {**states, **inputs}
-        self.roles = [_Role(n, u, False) for n, u in states.items()]
-        self.roles += [_Role(n, u, True) for n, u in inputs.items()]
-        by_joint = joint_units(joints)
+        rates = rate_states(model) if model is not None else {}
+        self.rates = {q: w for q, w in rates.items() if {q, w} <= {*self.units}}
+        joints = joint_names(log)
+        conventions = joint_units(joints)
         self.numbers = [
             _Number(
                 one.path,
                 topic,
                 one,
-                self.stated.unit(one.path),
-                unit_of(one.path, by_joint),
+                log.unit(one.path),
+                conventions.get(one.path, unit_of(one.path)),
                 bool(words.COMMAND_TOPIC.search(topic.topic.lower())),
             )
             for topic in log.topics
@@ -153,19 +138,19 @@ class _Table:
             if not words.PARTS.search(one.path)
         ]
         turn = ("", "rad", "deg")
-        angles = {n.path for n in self.numbers if n.known == "rad" or n.said in turn}
-        self.signals = Signals(log, angles)
+        self.signals = Signals(
+            log, {n.path for n in self.numbers if n.known == "rad" or n.said in turn}
+        )
         self.at = {number.path: k for k, number in enumerate(self.numbers)}
-        self.row = {role.name: r for r, role in enumerate(self.roles)}
-        self.points = np.zeros((len(self.roles), len(self.numbers)))
+        self.row = {role: r for r, role in enumerate(self.units)}
+        self.points = np.zeros((len(self.row), len(self.numbers)))
         self.why: dict[tuple[str, str], list[Finding]] = {}
         self.named, self.doubted = set[tuple[str, str]](), set[tuple[str, str]]()
-        for role in self.roles:
-            paths = [number.path for number in self.numbers]
-            called = words.meanings(role.name, role.unit * role.sent, paths, [*states])
+        for role, unit in self.units.items():
+            called = words.meanings(role, unit * (role in inputs), self.at, [*states])
             for number in self.numbers:
                 self._by_itself(role, number, called)
-        self._by_joints()
+        self._by_joints(joints)
 
     def add(self, name: str, path: str, points: float, *why: Finding) -> None:
         """Add evidence for a number in a role."""
@@ -173,61 +158,50 @@ class _Table:
             self.points[self.row[name], self.at[path]] += points
             self.why.setdefault((name, path), []).extend(why)
 
-    def _by_itself(self, role: _Role, number: _Number, called: Sequence[str]) -> None:
-        """Count what a number's name, unit and kind say."""
-        if role.sent and number.measured:
-            self.add(role.name, number.path, -2 * CAP)
+    def _by_itself(self, role: str, number: _Number, called: Sequence[str]) -> None:
+        """Count what a number's name, unit and kind say; a name says less if it never changes."""
+        sent, unit, one = role in self.inputs, self.units[role], number.field
+        if sent and number.measured:
+            self.add(role, number.path, -2 * CAP)
             return
-        name = self._name(role, number, called)
-        if name or (number.moves and number.field.low is not None):
-            kind = 1.0 * (role.sent and number.command and number.moves)
-            self.add(role.name, number.path, name + self._unit(role, number) + kind)
-
-    def _name(self, role: _Role, number: _Number, called: Sequence[str]) -> float:
-        """Return the points of a name, fewer for a number that stays the same; 0 if none fits."""
-        topic, one = number.topic, number.field
-        points = words.name_points(called, role.name, topic, one, is_input=role.sent)
+        points = words.name_points(called, role, number.topic, one, is_input=sent)
         if points:
-            self.named.add((role.name, number.path))
-        return points and points - 1.0 * (not number.moves)
+            self.named.add((role, number.path))
+        elif not number.moves or one.low is None:
+            return
+        points -= 1.0 * (not number.moves)
+        points += 1.0 * (sent and number.command and number.moves)
+        theirs = number.said or number.known
+        fits = factor_between(theirs, unit) is not None
+        why: list[Finding] = []
+        if unit in ("", "1"):
+            points += STATED * bool(number.said and unit and fits)
+        elif theirs:
+            why = [found("start.unit", role, unit=theirs, model=None if fits else unit)]
+            other = -1.5 if number.said or sent else -CAP  # of another sensor
+            points += (STATED if number.said else 0.5) if fits else other
+        self.add(role, number.path, points, *why)
 
-    def _unit(self, role: _Role, number: _Number) -> float:
-        """Return the points of a unit, stated by the log or known by convention."""
-        unit, fits = number.said or number.known, self._fits(role, number)
-        if role.unit in ("", "1"):
-            return STATED * bool(number.said and role.unit) * fits
-        if not unit:
-            return 0.0
-        why = found("start.unit", role.name, unit=unit, model=None if fits else role.unit)
-        self.add(role.name, number.path, 0.0, why)
-        other = -1.5 if number.said or role.sent else -CAP  # of another sensor
-        return (STATED if number.said else 0.5) if fits else other
-
-    def _fits(self, role: _Role, number: _Number) -> bool:
-        return factor_between(number.said or number.known, role.unit) is not None
-
-    def _by_joints(self) -> None:
+    def _by_joints(self, joints: Joints) -> None:
         """Count the names of joints, and their order where no name says more."""
-        bare = {}
-        for role in self.roles:
-            own = of_joint(role.name, role.unit, self.joints, self.log, sent=role.sent)
-            self._joint(role.name, own)
-            if not own and self.points[self.row[role.name]].max(initial=0.0) < POINTS_TO_PROPOSE:
-                bare[role.name] = role.unit, role.sent
-        for name, own in in_order(bare, self.joints, self.log).items():
-            self._joint(name, own)
-
-    def _joint(self, name: str, own: Mapping[str, Joint]) -> None:
-        for path, one in own.items():
-            self.add(name, path, one.points, one.why)
-            if one.doubted:
-                self.doubted.add((name, path))
-            if one.points >= NAMED - SURE_LEAD:
-                self.named.add((name, path))
+        bare, evidence = {}, dict[str, Mapping[str, Joint]]()
+        for role, unit in self.units.items():
+            sent = role in self.inputs
+            evidence[role] = of_joint(role, unit, joints, self.log, sent=sent)
+            best = self.points[self.row[role]].max(initial=0.0)
+            if not evidence[role] and best < POINTS_TO_PROPOSE:
+                bare[role] = unit, sent
+        for role, own in (evidence | in_order(bare, joints, self.log)).items():
+            for path, one in own.items():
+                self.add(role, path, one.points, one.why)
+                if one.doubted:
+                    self.doubted.add((role, path))
+                if one.points >= NAMED - SURE_LEAD:
+                    self.named.add((role, path))
 
     def factor(self, name: str, path: str) -> float:
         """Return the factor from the unit that the log states for a number to a role's."""
-        return self.stated.factor(path, self.units[name])
+        return self.log.factor(path, self.units[name])
 
     def taken(self) -> dict[str, str]:
         """Return the number of each role, as far as one has enough points: {name: path}."""
@@ -238,20 +212,20 @@ class _Table:
         rows, columns = linear_sum_assignment(
             np.hstack([gain, np.zeros((roles, roles))]), maximize=True
         )
-        pairs = zip(rows, columns, strict=True)
-        return {self.roles[r].name: self.numbers[k].path for r, k in pairs if k < numbers}
+        names, pairs = [*self.row], zip(rows, columns, strict=True)
+        return {names[r]: self.numbers[k].path for r, k in pairs if k < numbers}
 
     def look(self) -> None:
         """Count what the samples say of rates, of speeds and of angles' commands."""
         if self.model is None or not self.numbers:
             return
         first = self.taken()
-        for role in (one for one in self.roles if one.sent):
-            angle, path = first.get(without_role(role.name), ""), first.get(role.name, "")
+        for role in self.inputs:
+            angle, path = first.get(without_role(role), ""), first.get(role, "")
             if angle and path.endswith("@rpy." + path.rpartition(".")[2]) and angle != path:
                 like = self.signals.lagged(path, angle, LATEST)
                 if like is not None and like < FOLLOWS:
-                    self.add(role.name, path, -2 * CAP)
+                    self.add(role, path, -2 * CAP)
         for pair in self.rates.items():
             self._relate(pair, first)
         self._speed(self.model)
@@ -267,17 +241,19 @@ class _Table:
         bare = [name for name in pair if not own[name]]
         if len(free) <= UNNAMED:
             own |= {name: self._possible(name, free) for name in bare}
-        like = self._likes(own[q], own[w])
+        self.signals.read([*own[q], *own[w]])
 
         # Each gains what the best pair that it is in explains.
         gains = dict[tuple[str, str], float]()
-        for (a, b), one in like.items():
-            by = self.factor(q, a), self.factor(w, b)
-            stated = [self.stated.unit(path) for path in (a, b)]
-            fits = any(True for _ in _readings(one.slope * by[1] / by[0], stated, by))
-            if not first and len(bare) == 2 and one.tenfold is None:
+        for a, b in ((a, b) for a in own[q] for b in own[w] if a != b):
+            like, stated = self.signals.follows(a, b), (self.log.unit(a), self.log.unit(b))
+            if abs(like.correlation) < FOLLOWS:
                 continue
-            points = _capped(one) - 1.5 * (not fits) - 0.5 * (one.correlation < 0)
+            if not first and len(bare) == 2 and like.tenfold is None:
+                continue
+            by = self.factor(q, a), self.factor(w, b)
+            fits = any(True for _ in _readings(like.slope * by[1] / by[0], stated, by))
+            points = _capped(like) - 1.5 * (not fits) - 0.5 * (like.correlation < 0)
             for one_of in ((q, a), (w, b)):
                 gains[one_of] = max(gains.get(one_of, 0.0), points)
         for (name, path), points in gains.items():
@@ -299,23 +275,17 @@ class _Table:
             and ("" in (unit, n.said or n.known) or factor_between(n.said or n.known, unit))
         ]
 
-    def _likes(self, first: Sequence[str], second: Sequence[str]) -> dict[tuple[str, str], Follows]:
-        """Return which numbers follow which, and how."""
-        self.signals.read([*first, *second])
-        likes = {(a, b): self.signals.follows(a, b) for a in first for b in second if a != b}
-        return {pair: one for pair, one in likes.items() if abs(one.correlation) >= FOLLOWS}
-
     def _speed(self, model: Model) -> None:
         """Count how an unnamed number follows the speed of the position."""
         name, position = str(model.roles.get("speed", "")), model.roles.get("position", ())
         first = self.taken()
-        if name not in self.row or name in first or not all(axis in first for axis in position):
+        if name not in self.row or name in first or not {*position} <= {*first} or not position:
             return
-        axes, taken = [first[axis] for axis in position], {*first.values()}
-        bare = [n.path for n in self.numbers if n.moves and n.path not in taken]
+        axes = [first[axis] for axis in position]
+        bare = [n.path for n in self.numbers if n.moves and n.path not in {*first.values()}]
         bare = [p for p in bare if p.partition("[")[0].endswith(".data")][:COMBINATIONS]
-        self.signals.read([*axes, *bare] * bool(axes))
-        for path in bare * bool(axes):
+        self.signals.read([*axes, *bare])
+        for path in bare:
             if (gridded := self.signals.grid((*axes, path))) is None:
                 continue
             step, (*places, speed) = gridded
@@ -332,23 +302,21 @@ class _Table:
     def solved(self, *, named: bool) -> dict[str, Guess]:
         """Return the assignment of most points by name; other roles have what may fit.
 
-        Args:
-            named: whether roles are named after numbers, so that none is left for another.
+        If roles are `named` after numbers, none is left for another.
         """
         taken = self.taken()
-        sent = {path for name, path in taken.items() if self.roles[self.row[name]].sent}
+        sent = {path for name, path in taken.items() if name in self.inputs}
         left = [n for n in self.numbers if n.moves and n.path not in {*taken.values()}]
-        lost = [role for role in self.roles if role.name not in taken]
-        tops = {role.name: self._best_fitting(role.name, left) for role in lost}
+        lost = [role for role in self.row if role not in taken]
+        tops = {role: self._best_fitting(role, left) for role in lost}
         last = not named and len(lost) == len(left) == 1 and not any(tops.values())
-        tops |= {lost[0].name: [left[0].path]} if last else {}
+        tops |= {lost[0]: [left[0].path]} if last else {}
         made = dict[str, Guess]()
-        for role in self.roles:
-            name, path = role.name, taken.get(role.name, "")
-            top = tops.get(name, [])
+        for name in self.row:
+            path, top = taken.get(name, ""), tops.get(name, [])
             others = {path for other, some in tops.items() if other != name for path in some}
             if path:
-                away = {*taken.values()} - sent if role.sent else sent
+                away = {*taken.values()} - sent if name in self.inputs else sent
                 near = tuple(p for p in self._near(name) if p != path and p not in away)
                 sure = not near and (name, path) in self.named - self.doubted
                 made[name] = Guess(name, path, "", sure, near, None, self._why(name, path))
@@ -357,11 +325,10 @@ class _Table:
                 clear = number.command and self.points[self.row[name], self.at[top[0]]] >= SURE_LEAD
                 sure = clear or (len(lost) == len(left) == 1 and not last)
                 why = found("start.left", name, numbers=tuple(top), only=not last or None)
-                made[name] = Guess(
-                    name, top[0], "", sure, (), None, (*self._why(name, top[0]), why)
-                )
+                reasons = (*self._why(name, top[0]), why)
+                made[name] = Guess(name, top[0], "", sure, (), None, reasons)
             else:
-                made[name] = self._offered(role, left)
+                made[name] = self._offered(name, left)
         return made
 
     def _why(self, name: str, path: str) -> tuple[Finding, ...]:
@@ -373,33 +340,31 @@ class _Table:
         fits = {n.path: row[self.at[n.path]] for n in left if row[self.at[n.path]] >= 1.0}
         return [path for path in fits if fits[path] > max(fits.values()) - LEAD]
 
-    def _offered(self, role: _Role, left: Sequence[_Number]) -> Guess:
+    def _offered(self, role: str, left: Sequence[_Number]) -> Guess:
         """Return a role without a number: the commands, what has points, or what is possible."""
-        row, possible = self.points[self.row[role.name]], {*self._possible(role.name, left)}
-        may = [n for n in left if not (role.sent and n.measured)]
-        some = [n for n in may if role.sent and n.command]
+        row, possible = self.points[self.row[role]], {*self._possible(role, left)}
+        sent = role in self.inputs
+        may = [n for n in left if not (sent and n.measured)]
+        some = [n for n in may if sent and n.command]
         some = some or [n for n in may if row[self.at[n.path]] > 0]
         some = some or [n for n in may if n.path in possible and not n.said]
         some.sort(key=lambda n: -float(row[self.at[n.path]]))
         empty = [t.topic for t in self.log.topics if not t.messages]
         empty = [topic for topic in empty if words.COMMAND_TOPIC.search(topic.lower())]
-        why = (found("start.still", *empty, empty=True),) if empty and role.sent else ()
+        why = (found("start.still", *empty, empty=True),) if empty and sent else ()
         others = tuple(n.path for n in some)[:MOST_CANDIDATES]
-        return Guess(role.name, "", "", False, others, None, why)
+        return Guess(role, "", "", False, others, None, why)
 
     def finished(self, guess: Guess) -> Guess:
         """Return a guess with its clock, its range, and the unit that the log states."""
         path = guess.path or next(iter(guess.others), "")
         if path not in self.at:
             return replace(guess, clock="log")
-        number = self.numbers[self.at[path]]
-        clock = self.log.clock(number.topic)
+        number, factor = self.numbers[self.at[path]], self.factor(guess.name, path)
+        guess = replace(guess, clock=self.log.clock(number.topic))
         if not guess.path:
-            return replace(guess, clock=clock, scale=self.factor(guess.name, path))
-        guess = replace(guess, clock=clock, field=number.field)
-        if len(guess.others) > 3:
-            guess = replace(guess, others=guess.others[:3])
-        factor = self.factor(guess.name, path)
+            return replace(guess, scale=factor)
+        guess = replace(guess, field=number.field, others=guess.others[:3])
         return replace(guess, scale=guess.scale * factor) if abs(factor - 1) > 1e-9 else guess
 
 
@@ -447,7 +412,7 @@ def _followed(
         return {w.name: w.because(why, sure=False)} if size else {}
 
     # In which units do they agree?
-    stated = [table.stated.unit(one.path) for one in (q, w)]
+    stated = [table.log.unit(one.path) for one in (q, w)]
     reading = next(_readings(slope, stated, by), None)
     if reading is None:
         w = w.because(found("start.follows", w.name, of=q.path, slope=slope), sure=False)
@@ -462,7 +427,7 @@ def _followed(
 
         # Each is as sure as the other if nothing else rivals with it.
         alone = [not g.others and (g.name, g.path) not in table.doubted for g in (q, w)]
-        kind = stated[0] or unit_of(q.path, joint_units(table.joints)) in LENGTHS
+        kind = stated[0] or table.numbers[table.at[q.path]].known in LENGTHS
         same = min(abs(slope - 1), abs(like.slope - 1)) < SAME
         sure = (kind and size > SURELY and same) or (w.sure and w.scale == 1)
         q = replace(q, sure=q.sure or bool(alone[0] and sure and q.scale == 1))

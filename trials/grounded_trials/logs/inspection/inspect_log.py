@@ -15,6 +15,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.findings import Finding, Quantity, Weight, found
+from grounded.units import factor_between
 from grounded_trials.formats.bad import Bad, BadPath
 from grounded_trials.formats.mcap_records import About, Header, Messages, Metadata, Rows
 from grounded_trials.formats.mcap_walk import DamagedFile, Part, Topic, by_topic
@@ -33,7 +34,8 @@ from grounded_trials.formats.tables import AS_IT_SAYS, Layout
 from grounded_trials.logs.log_files import log_records, read_apart
 from grounded_trials.logs.samples import MIXED_S
 from grounded_trials.logs.signal_report import SKEW_S
-from grounded_trials.logs.stated_units import Stated
+from grounded_trials.logs.signals import Clock
+from grounded_trials.logs.stated_units import unit_in_name
 
 NAMING = {  # types of messages that name joints, and their field
     "/JointState": "name",
@@ -91,10 +93,15 @@ class LogReport:
     layout: Layout = AS_IT_SAYS  # what was said of its table
     about: tuple[About, ...] = ()  # what its files say of their tables
 
-    @cached_property
-    def stated(self) -> Stated:
-        """The units that it states: those of its first file, and in names."""
-        return Stated(self.about[0].units if self.about else {})
+    def unit(self, path: str) -> str:
+        """Return the unit of a number that a table's first row or the name states, "" for none."""
+        heads = self.about[0].units if self.about else {}
+        return heads.get(path) or unit_in_name(path)
+
+    def factor(self, path: str, wanted: str) -> float:
+        """Return the factor from the unit that it states to another; 1 if it states none."""
+        found = factor_between(said, wanted) if (said := self.unit(path)) else None
+        return 1.0 if found is None else found
 
     @property
     def numbers(self) -> list[FieldReport]:
@@ -113,9 +120,13 @@ class LogReport:
 
     def number(self, path: str) -> FieldReport | None:
         """Return the number at a path, None if it is not in the log."""
-        return next((one for one in self.numbers if one.path == path), None)
+        return self._by_path.get(path)
 
-    def clock(self, topic: TopicReport | None) -> str:
+    @cached_property
+    def _by_path(self) -> dict[str, FieldReport]:
+        return {one.path: one for one in self.numbers}
+
+    def clock(self, topic: TopicReport | None) -> Clock:
         """Return the clock by which a topic's numbers are read."""
         return "header" if topic is not None and topic.stamped and not self.simulated else "log"
 
@@ -127,35 +138,28 @@ class LogReport:
     @cached_property
     def findings(self) -> tuple[Finding, ...]:
         """What is odd about the log, besides its damage."""
-        return _findings(self)
+        odd = [one for about in self.about for one in about.findings]
+        for topic in self.topics:
+            name, warn = topic.topic, Weight.WARN
+            if topic.problem:
+                odd.append(found("file.unreadable", name, why=topic.problem, weight=warn))
+            gap = topic.largest_gap_s if topic.messages > 1 and topic.rate_hz else 0.0
+            gap *= gap * topic.rate_hz > GAP
+            if topic.messages < 2 or gap:
+                longest = Quantity(gap, "s")
+                odd.append(found("file.odd_values", name, messages=topic.messages, gap=longest))
+            if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
+                odd.append(found("file.clocks", name, "log", apart=abs(topic.skew_s), weight=warn))
+            if len(topic.fields) >= FIELD_LIMIT:
+                odd.append(found("file.odd_values", name, first=FIELD_LIMIT))
+            if bad := [field.path for field in topic.fields if field.not_finite]:
+                odd.append(found("file.odd_values", bad[0], lost="some"))
+        return tuple(odd)
 
     @property
     def remarks(self) -> tuple[str, ...]:
         """Its damage and the findings as sentences."""
         return tuple(one.sentence for one in (self.damage, *self.findings) if one)
-
-
-def _findings(log: LogReport) -> tuple[Finding, ...]:
-    odd = [one for about in log.about for one in about.findings]
-    for topic in log.topics:
-        name, bad = topic.topic, [f.path for f in topic.fields if f.not_finite]
-        if topic.problem:
-            odd.append(found("file.unreadable", name, why=topic.problem, weight=Weight.WARN))
-        gap = topic.largest_gap_s if topic.messages > 1 and topic.rate_hz else 0.0
-        gap *= gap > GAP / max(topic.rate_hz, 1e-9)
-        if topic.messages < 2 or gap:
-            odd.append(
-                found("file.odd_values", name, messages=topic.messages, gap=Quantity(gap, "s"))
-            )
-        if topic.skew_s is not None and abs(topic.skew_s) > SKEW_S:
-            odd.append(
-                found("file.clocks", name, "log", apart=abs(topic.skew_s), weight=Weight.WARN)
-            )
-        if len(topic.fields) >= FIELD_LIMIT:
-            odd.append(found("file.odd_values", name, first=FIELD_LIMIT))
-        if bad:
-            odd.append(found("file.odd_values", bad[0], lost="some"))
-    return tuple(odd)
 
 
 def inspect_log(paths: str | Path | Sequence[str | Path], layout: Layout = AS_IT_SAYS) -> LogReport:
@@ -234,81 +238,70 @@ class _Topic:
             self.looked += int(chosen.sum())
             batch = batch.take(chosen)
         try:
-            if self.decoder is None:
-                self.decoder = decoder_of(self.of.channel, self.of.schema)
+            self.decoder = self.decoder or decoder_of(self.of.channel, self.of.schema)
             for part in self.decoder.parts(batch):
-                self._look(self.decoder, part)
+                self._look(self.decoder.name, part)
         except Bad as error:
             self.problem = str(error)
 
-    def _look(self, decoder: Decoder, part: Decoded) -> None:
+    def _look(self, kind: str, part: Decoded) -> None:
         if not self.paths:
-            self._find_paths(part)
-        self.joints |= _joints_in(part, decoder)
-        for i, (path, parsed) in enumerate(self.paths.items()):
+            topic = self.of.name if is_topic(self.of.name) else f'"{self.of.name}"'
+            for rest in dict.fromkeys(rest for one in part.samples for rest in number_paths(one)):
+                with suppress(GroundedError):  # a name that no path can contain
+                    path = parse_path(topic + rest)
+                    self.paths[path.text] = path
+
+        # The joints that the first and last of the messages name.
+        listed = next((name for end, name in NAMING.items() if kind.endswith(end)), "")
+        some = [one for one in part.samples if listed in names_in(one)]
+        self.joints |= {tuple(map(str, names)) for names in fields_of(some, listed)}
+        for i, (text, path) in enumerate(self.paths.items()):
             try:
-                values = evaluate(part, parsed, stamps=i == 0)
+                values = evaluate(part, path, stamps=i == 0)
             except BadPath:  # of another kind in another JSON message
                 continue
-            self.values.setdefault(path, []).append(values.values)
+            self.values.setdefault(text, []).append(values.values)
             if values.stamps is not None and len(values.stamps):
                 self.skews.append(values.stamps - part.log_times[values.rows])
-
-    def _find_paths(self, part: Decoded) -> None:
-        topic = self.of.name if is_topic(self.of.name) else f'"{self.of.name}"'
-        for rest in dict.fromkeys(rest for one in part.samples for rest in number_paths(one)):
-            with suppress(GroundedError):  # a name that no path can contain
-                path = parse_path(topic + rest)
-                self.paths[path.text] = path
 
     def report(self, start: int) -> TopicReport:
         t = np.concatenate(self.log_times) if self.log_times else np.zeros(0, dtype=np.int64)
         gaps = np.diff(np.sort(t)) * 1e-9
-        low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
-        median = float(np.median(gaps)) if len(gaps) else 0.0
+        low, median, high = np.percentile(gaps, [5, 50, 95]) if len(gaps) else (0.0, 0.0, 0.0)
         skews = np.concatenate(self.skews) if self.skews else None
-        numbers = {path: self.values[path] for path in self.paths if path in self.values}
-        fields = [_field(path, parts) for path, parts in numbers.items() if any(map(len, parts))]
+        numbers = ((path, self.values.get(path, [])) for path in self.paths)
         return TopicReport(
             topic=self.of.name,
             type=self.of.schema.name if self.of.schema else "",
             encoding=self.of.channel.encoding,
             messages=self.count,
-            rate_hz=1 / median if median > 0 else 0.0,
+            rate_hz=1 / float(median) if median > 0 else 0.0,
             jitter_s=float(high - low) / 2,
             largest_gap_s=float(gaps.max(initial=0.0)),
             first_s=float(t.min() - start) * 1e-9 if len(t) else None,
             last_s=float(t.max() - start) * 1e-9 if len(t) else None,
             stamped=skews is not None,
             skew_s=None if skews is None else float(np.median(skews)) * 1e-9,
-            fields=tuple(fields),
+            fields=tuple(_field(path, some) for path, some in numbers if any(map(len, some))),
             problem=self.problem,
         )
 
 
-def _joints_in(part: Decoded, decoder: Decoder) -> set[tuple[str, ...]]:
-    """Return the lists of joints' names in the first and last of some messages."""
-    listed = next((field for name, field in NAMING.items() if decoder.name.endswith(name)), "")
-    some = [one for one in part.samples if listed in names_in(one)]
-    return {tuple(map(str, names)) for names in fields_of(some, listed)}
-
-
 def _field(path: str, parts: Sequence[Floats]) -> FieldReport:
-    """Return what there is to say of a number's values, given batch by batch."""
+    """Return what there is to say of a number's values, given batch by batch.
+
+    Its noise is a robust standard deviation of white noise, from second differences.
+    """
     some = [values[np.isfinite(values)] for values in parts]
     finite, count = np.concatenate(some), sum(map(len, parts))
-    noises = [_noise(values) for values in some if len(values) >= NOISE_SAMPLES]
+    bends = (np.median(np.abs(np.diff(v, 2))) for v in some if len(v) >= NOISE_SAMPLES)
     repeated = sum(int(((np.diff(v) == 0) & (v[1:] != 0)).sum()) for v in parts)
     return FieldReport(
         path=path,
         low=float(finite.min()) if len(finite) else None,
         high=float(finite.max()) if len(finite) else None,
         not_finite=count - len(finite),
-        noise=float(np.median(noises)) if noises else 0.0,
+        noise=float(np.median([*bends] or [0.0]) / (0.6745 * np.sqrt(6))),
         held=repeated / max(count - 1, 1),
     )
-
-
-def _noise(values: Floats) -> float:
-    """Return a robust standard deviation of a signal's white noise, from second differences."""
-    return float(np.median(np.abs(np.diff(values, 2))) / (0.6745 * np.sqrt(6)))

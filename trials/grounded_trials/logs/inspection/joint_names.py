@@ -17,6 +17,7 @@ from grounded_trials.logs.inspection.inspect_log import LogReport
 from grounded_trials.logs.inspection.names import COMMAND_TOPIC
 from grounded_trials.logs.stated_units import SLIDING, TURNING
 
+Joints = Mapping[str, tuple[str, ...]]  # names by topic, in the order of its numbers
 AIMED = {"feedback": ("reference", "output"), "actual": ("desired",)}  # done, and to be done
 PLURAL = {"position": "positions", "velocity": "velocities", "effort": "effort"}
 LIMB = ("base", "waist", "torso", "shoulder", "upper", "elbow", "fore", "wrist", "hand", "finger")
@@ -25,6 +26,7 @@ SLIDES = {  # words of prismatic joints, in metres
     *("trolley", "cart", "carriage", "slide", "slider", "rail", "prismatic", "linear", "gantry"),
 }
 TURNS = {*LIMB, *WITHIN, "tilt", "wheel", "hinge", "pole", "pendulum", "swing", "angle", "theta"}
+COMMANDS = ("cmd", "command", "effort", "torque", "desired", "ref")  # in topics of arrays
 # Points of a joint's number; less of each further one.
 NAMED, ORDERED, UNKNOWN, LESS = 6.0, 2.5, 1.5, 0.2
 
@@ -34,72 +36,59 @@ def joint_names(log: LogReport) -> dict[str, tuple[str, ...]]:
 
     A topic whose messages name different joints is left out, since its indices are ambiguous.
     """
-    there = _there(log)
-    parts = {t: [p for p in AIMED if f"{t}.{p}.positions[0]" in there] for t in log.joints}
+    parts = {t: [p for p in AIMED if log.number(f"{t}.{p}.positions[0]")] for t in log.joints}
     return {f"{t}.{parts[t][0]}" if parts[t] else t: names for t, names in log.joints.items()}
 
 
-def at_joints(joints: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return the topics that hold nothing but what joints do, without those of controllers."""
-    return {topic: names for topic, names in joints.items() if _part(topic) not in AIMED}
-
-
-def number_of(topic: str, kind: str, index: int) -> str:
-    """Return the path of a joint's position, velocity or effort."""
-    return f"{topic}.{PLURAL[kind] if _part(topic) in AIMED else kind}[{index}]"
-
-
-def _part(topic: str) -> str:
-    return topic.rpartition(".")[2]
-
-
-def _aimed_at(topic: str, kind: str, index: int, there: set[str]) -> str:
-    """Return the path of what a controller commands of a joint, "" if it is not in the log."""
-    base, _, part = topic.rpartition(".")
-    paths = [f"{base}.{aim}.{PLURAL[kind]}[{index}]" for aim in AIMED[part]]
-    return next((path for path in paths if path in there), "")
+def part_of(topic: str) -> str:
+    """Return which part of a controller's state stands for a topic, "" for another topic."""
+    part = topic.rpartition(".")[2]
+    return part if part in AIMED else ""
 
 
 def slides(joint: str) -> bool:
     """Check whether a joint's name is that of a prismatic joint: a trolley, a rail."""
-    return not SLIDES.isdisjoint(_words(joint))
+    return _is_of(joint, SLIDES)
 
 
-def turns(joint: str) -> bool:
-    """Check whether a joint's name is that of a revolute joint."""
-    return not TURNS.isdisjoint(_words(joint))
+def _is_of(joint: str, words: set[str]) -> bool:
+    found = re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)
+    return not words.isdisjoint(word.lower() for word in found)
 
 
-def _words(joint: str) -> list[str]:
-    return [word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", joint)]
-
-
-def joint_units(joints: Mapping[str, Sequence[str]]) -> dict[str, str]:
+def joint_units(joints: Joints) -> dict[str, str]:
     """Return the units of joints' numbers by path: rad for revolute, m for prismatic joints.
 
     "" for a joint whose name does not show its kind.
     """
     return {
-        number_of(topic, kind, i): unit * (slides(joint) or turns(joint))
+        _measured(topic, kind, i): unit * _is_of(joint, SLIDES | TURNS)
         for topic, names in joints.items()
         for i, joint in enumerate(names)
-        for kind, unit in (SLIDING if slides(joint) else TURNING).items()
+        for kind, unit in _units(joint).items()
     }
+
+
+def _units(joint: str) -> dict[str, str]:
+    return SLIDING if slides(joint) else TURNING
+
+
+def _measured(topic: str, kind: str, index: int) -> str:
+    """Return the path of a joint's position, velocity or effort."""
+    return f"{topic}.{PLURAL[kind] if part_of(topic) else kind}[{index}]"
 
 
 def from_base(joints: Sequence[str]) -> tuple[str, ...]:
     """Sort the joints of an arm from its base, by body parts and numbers."""
 
     def place(joint: str) -> tuple[int, int, list[int]]:
-        numbers = [int(n) for n in re.findall(r"\d+", joint)]
-        return _first(LIMB, joint), _first(WITHIN, joint), numbers
+        limb, within = (
+            next((i for i, word in enumerate(words) if word in joint.lower()), len(words))
+            for words in (LIMB, WITHIN)
+        )
+        return limb, within, [int(n) for n in re.findall(r"\d+", joint)]
 
     return tuple(sorted(joints, key=place))
-
-
-def _first(words: Sequence[str], joint: str) -> int:
-    """Return the index of the first word in a joint's name; `len(words)` if there is none."""
-    return next((i for i, word in enumerate(words) if word in joint.lower()), len(words))
 
 
 @dataclass(frozen=True)
@@ -112,32 +101,33 @@ class Joint:
 
 
 def of_joint(
-    name: str, unit: str, joints: Mapping[str, tuple[str, ...]], log: LogReport, *, sent: bool
+    name: str, unit: str, joints: Joints, log: LogReport, *, sent: bool
 ) -> dict[str, Joint]:
     """Return the numbers of the joint that the name of a state or input contains, by path."""
     for topic, names in joints.items():
-        for joint in (joint for joint in names if holds(name, joint)):
-            kind = {u: k for k, u in (SLIDING if slides(joint) else TURNING).items()}.get(unit)
+        for joint in (joint for joint in names if _holds(name, joint)):
+            kind = {u: k for k, u in _units(joint).items()}.get(unit)
             kind = kind or ("position" if unit in ("m", "1") else "")
-            why = found("start.joint", topic, joint=joint)
-            measured = Joint(NAMED, why, doubted=False)
-            plain = unit == "1"  # commands may be torques, positions or speeds
+            measured = Joint(NAMED, found("start.joint", topic, joint=joint), doubted=False)
+            plain = sent and unit == "1"  # commands may be torques, positions or speeds
             if kind and (some := _numbers(topic, names, joint, kind, measured, log, sent, plain)):
                 return some
     return {}
 
 
+def _holds(name: str, joint: str) -> bool:
+    """Check whether a state's name is a joint's, perhaps with a word for the quantity."""
+    plain = re.sub(r"(_?joint_?)", "", joint.lower()) or joint.lower()
+    return not {joint.lower(), plain}.isdisjoint((name.lower(), *name.lower().split("_")))
+
+
 def in_order(
-    roles: Mapping[str, tuple[str, bool]], joints: Mapping[str, tuple[str, ...]], log: LogReport
+    roles: Mapping[str, tuple[str, bool]], joints: Joints, log: LogReport
 ) -> dict[str, dict[str, Joint]]:
     """Return the numbers of each state and input in order from the base, if none has a name.
 
     There must be as many of a unit as joints. Prismatic joints have states in m, revolute in rad.
-
-    Args:
-        roles: the unit of each state and input without a matching name, and whether it is sent.
-        joints: see `joint_names`.
-        log: an inspected log.
+    `roles` has the unit of each without a matching name, and whether it is sent.
     """
     if len(joints) != 1:
         return {}
@@ -148,15 +138,12 @@ def in_order(
         for kind, unit in kinds.items():
             those = [name for name, (own, _) in roles.items() if own == unit]
             for name, joint in zip(those, some, strict=True) if len(those) == len(some) else ():
-                why = found("start.joint", topic, joint=joint, index=str(_place(joint, names)))
-                points = ORDERED if slide or turns(joint) else UNKNOWN
+                at = str(from_base(names).index(joint))
+                points = ORDERED if _is_of(joint, SLIDES | TURNS) else UNKNOWN
+                why = found("start.joint", topic, joint=joint, index=at)
                 measured = Joint(points, why, doubted=len(some) > 1)
                 given[name] = _numbers(topic, names, joint, kind, measured, log, roles[name][1])
     return given
-
-
-def _place(joint: str, names: Sequence[str]) -> int:
-    return from_base(names).index(joint)
 
 
 def _numbers(
@@ -175,39 +162,30 @@ def _numbers(
     delay and the limits of the drive; measured positions and velocities are no commands. Of
     several arrays, a joint has the number at its place from the base; the others rival with it.
     """
-    there, path = _there(log), number_of(topic, kind, names.index(joint))
-    torque = sent and kind == "effort"
-    if sent and _part(topic) in AIMED:
-        path = _aimed_at(topic, kind, names.index(joint), there)
-    elif arrays := commands(log, len(names)) if torque or (sent and plain) else []:
-        at = _place(joint, names)
-        paths = [f"{array}[{at}]" for array in arrays] + [path] * (torque and path in there)
+    index, torque = names.index(joint), sent and kind == "effort"
+    path, part = _measured(topic, kind, index), part_of(topic)
+    if sent and part:
+        aims = (f"{topic.removesuffix(part)}{aim}" for aim in AIMED[part])
+        paths = [f"{aim}.{PLURAL[kind]}[{index}]" for aim in aims]
+        path = next((path for path in paths if log.number(path)), "")
+    elif arrays := _commands(log, len(names)) if torque or plain else []:
+        at = from_base(names).index(joint)
+        efforts = [path] * (torque and log.number(path) is not None)
+        paths = [f"{array}[{at}]" for array in arrays] + efforts
         paths += [f"{array}[{k}]" for array in arrays for k in range(len(names)) if k != at]
         why = found("start.joint", arrays[0], joint=joint, index=str(at))
         return {path: Joint(NAMED - LESS * k, why) for k, path in enumerate(paths)}
-    elif sent and kind != "effort" and not COMMAND_TOPIC.search(topic.lower()):
+    elif sent and not torque and not COMMAND_TOPIC.search(topic.lower()):
         return {}
-    return {path: measured} if path in there else {}
+    return {path: measured} if log.number(path) else {}
 
 
-def _there(log: LogReport) -> set[str]:
-    """Return the paths of a log's numbers."""
-    return {one.path for one in log.numbers}
-
-
-def commands(log: LogReport, count: int) -> list[str]:
+def _commands(log: LogReport, count: int) -> list[str]:
     """Return array topics with a command for each of `count` joints."""
-    words = ("cmd", "command", "effort", "torque", "desired", "ref")
     return [
         f"{topic.topic}.data"
         for topic in log.topics
         if "MultiArray" in topic.type
-        and any(word in topic.topic.lower() for word in words)
+        and any(word in topic.topic.lower() for word in COMMANDS)
         and sum(".data[" in field.path for field in topic.fields) == count
     ]
-
-
-def holds(name: str, joint: str) -> bool:
-    """Check whether a state's name is a joint's, perhaps with a word for the quantity."""
-    plain = re.sub(r"(_?joint_?)", "", joint.lower()) or joint.lower()
-    return not {joint.lower(), plain}.isdisjoint((name.lower(), *name.lower().split("_")))

@@ -7,11 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from grounded_trials.formats.message_path import AXES, WORLD
 from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
-from grounded_trials.logs.stated_units import (
-    bare_command,
-    without_role,
-    without_unit,
-)
+from grounded_trials.logs.stated_units import bare_command, without_role, without_unit
 
 MEASURED = ("/Odometry", "/Imu")  # messages that hold no commands
 
@@ -77,11 +73,8 @@ WORTH, LESS = 4.0, 0.3  # points of the usual name, less of each further one
 def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) -> tuple[str, ...]:
     """Return the usual names of a state or input, its own first.
 
-    Args:
-        name: of the state or input.
-        unit: of an input, by which it may be called; "" for a state.
-        paths: of the log's numbers: north and east are axes only if it has both.
-        states: names of the model's states: beside a surge u, v is the sway.
+    An input may be called by its `unit`, "" for a state. North and east are axes only if the log
+    has both; beside a state u, the surge, v is the sway.
     """
     if name == "v" and "u" in states:
         return (name, *_BESIDE_U)
@@ -96,39 +89,28 @@ def name_points(
     called: Sequence[str], name: str, topic: TopicReport, field: FieldReport, *, is_input: bool
 ) -> float:
     """Return how well a number's name fits, 0 for not at all."""
-    plain = bare_command if is_input else without_unit
-    ways = {one[len(topic.topic) :].lower().strip('".') for one in (field.path, plain(field.path))}
-    best = max(_fit(called, one, topic.topic.lower()) for one in ways)
-    if best <= 0 and is_input and COMMAND_TOPIC.search(topic.topic.lower()):
-        state = without_role(name)  # the command of a state, such as roll_command
-        usual = (state, *_MEANINGS.get(state, ())) if state != name else ()
-        best = max((_fit(usual, one, topic.topic.lower()) for one in ways), default=0.0)
-    if best <= 0:
-        return 0.0
-    words = {*_WORD.findall(field.path.lower())}
-    commanded = any(word in words for word in _COMMANDED)
-    return best if is_input else best - 2.0 * commanded + 0.5 * topic.stamped
+    plain, on = bare_command if is_input else without_unit, topic.topic.lower()
+    ways = {one[len(on) :].lower().strip('".') for one in (field.path, plain(field.path))}
+    best = max(_fit(called, one, on) for one in ways)
+    state = without_role(name)  # the command of a state, such as roll_command
+    if best <= 0 and is_input and state != name and COMMAND_TOPIC.search(on):
+        best = max(_fit((state, *_MEANINGS.get(state, ())), one, on) for one in ways)
+    if best <= 0 or is_input:
+        return max(best, 0.0)
+    commanded = not {*_WORD.findall(field.path.lower())}.isdisjoint(_COMMANDED)
+    return best - 2.0 * commanded + 0.5 * topic.stamped
 
 
 def _fit(called: Sequence[str], inside: str, topic: str) -> float:
     """Score how well a name fits: by the end of the path, or by the topic if that is generic."""
-    best = 0.0
+    last = re.sub(r"[_\d]+$", "", topic.rsplit("/", 1)[-1])
+    table = last in TABLES and not {".", "["} & {*inside}
+    whole = last if inside in ("data", "value") else inside * table
+    words, best = _WORD.findall(whole), 0.0
     for rank, meaning in enumerate(called):
         worth = WORTH - LESS * max(rank - 1, 0)
         if inside == meaning or inside.endswith("." + meaning):
-            best = max(best, worth + (0.5 if "." in meaning else 0.0))
-        last = re.sub(r"[_\d]+$", "", topic.rsplit("/", 1)[-1])
-        if inside in ("data", "value") and last == meaning:
-            best = max(best, worth)
-        elif len(meaning) > 1:
-            best = (
-                max(best, worth - 1.0) if meaning in _WORD.findall(_named(inside, last)) else best
-            )
+            best = max(best, worth + 0.5 * ("." in meaning))
+        elif whole == meaning or (len(meaning) > 1 and meaning in words):
+            best = max(best, worth - 1.0 * (whole != meaning))
     return best
-
-
-def _named(inside: str, last: str) -> str:
-    """Return the text whose words name a number: a topic of one number, or a table's column."""
-    if inside in ("data", "value"):
-        return last
-    return "" if "." in inside or "[" in inside or last not in TABLES else inside

@@ -1,4 +1,4 @@
-"""What the samples of a log say of which number is what: rates, and what a model's inputs do.
+"""What the samples of a log say of which number is what: rates, commands of angles.
 
 `Signals` reads the samples once and puts them on a common grid; `follows` compares two of them.
 """
@@ -47,12 +47,9 @@ class Follows:
 
 
 def follows(q: Floats, w: Floats, step: float) -> Follows:
-    """Compare w with the derivative of q, both averaged over a few samples.
+    """Compare w (N,) with the derivative of q (N,), both averaged over a few samples.
 
-    Args:
-        q: (N,) position.
-        w: (N,) rate.
-        step: sample time [s].
+    `step` is the sample time [s].
     """
     slope = (q[SPAN:] - q[:-SPAN]) / (SPAN * step)
     mean = np.convolve(0.5 * (w[1:] + w[:-1]), np.ones(SPAN) / SPAN, "valid")
@@ -74,14 +71,12 @@ class Signals:
 
     def __init__(self, log: LogReport, angles: Collection[str] = ()) -> None:
         self.log, self._angles = log, angles
-        self.found: dict[str, Samples] = {}
-        self._missing: set[str] = set()
+        self.found: dict[str, Samples | None] = {}  # None: they can't be read
 
     def read(self, paths: Iterable[str]) -> None:
         """Read the samples of further paths."""
-        more = [p for p in dict.fromkeys(paths) if p not in self.found and p not in self._missing]
-        clocks = {p: self.log.clock(self.log.topic_of(p)) for p in more}
-        specs = {p: SignalSpec(p, clock=clock) for p, clock in clocks.items()}  # type: ignore[arg-type]
+        clocks = {p: self.log.clock(self.log.topic_of(p)) for p in paths if p not in self.found}
+        specs = {p: SignalSpec(p, clock=clock) for p, clock in clocks.items()}
         series: dict[str, Series] = {}
         try:
             series = read_signals(self.log.files, specs, self.log.layout) if specs else {}
@@ -91,14 +86,12 @@ class Signals:
             for path, spec in specs.items():
                 with suppress(GroundedError):
                     series |= read_signals(self.log.files, {path: spec}, self.log.layout)
+        self.found |= dict.fromkeys(specs)
         for path, one in series.items():
-            try:
+            with suppress(GroundedError):
                 found = tidy(path, one, unwrap="@rpy" in path)
-            except GroundedError:
-                continue
-            angle = path in self._angles
-            self.found[path] = replace(found, y=unwound(found.y, least=0.9)) if angle else found
-        self._missing |= {*more} - self.found.keys()
+                angle = path in self._angles
+                self.found[path] = replace(found, y=unwound(found.y, least=0.9)) if angle else found
 
     def grid(self, paths: Sequence[str]) -> tuple[float, list[Floats]] | None:
         """Interpolate signals on a common grid.
@@ -107,12 +100,11 @@ class Signals:
             Its step [s] and one column per path; None if the signals don't overlap.
         """
         self.read(paths)
-        if not all(path in self.found and len(self.found[path].t) > ROWS for path in paths):
+        samples = [s for path in paths if (s := self.found[path]) and len(s.t) > ROWS]
+        if len(samples) < len(paths):
             return None
-        samples = [self.found[path] for path in paths]
         start, stop = max(s.t[0] for s in samples), min(s.t[-1] for s in samples)
-        step = max(s.interval for s in samples)
-        step = max(step, (stop - start) * 1e-9 / LONGEST)
+        step = max(*(s.interval for s in samples), (stop - start) * 1e-9 / LONGEST)
         t = np.arange(start, stop, round(step * 1e9), dtype=np.int64)
         if len(t) < ROWS:
             return None
@@ -128,10 +120,9 @@ class Signals:
         return follows(q, w, step)
 
     def lagged(self, sent: str, moved: str, latest: float) -> float | None:
-        """Return the largest correlation of a command with what follows it.
+        """Return the largest correlation of a command with what follows it, -1 for a constant one.
 
-        Returns:
-            -1 for a constant one; None if the signals don't overlap.
+        None if the signals don't overlap.
         """
         gridded = self.grid((sent, moved))
         if gridded is None:
@@ -148,11 +139,8 @@ class Signals:
         Only pairs whose units differ by a power of ten; each number is in one pair at most.
         """
         self.read(paths)
-        found = []
-        for a, b in permutations(paths, 2):
-            like = self.follows(a, b)
-            if (power := like.tenfold) is not None:
-                found.append((like.correlation, a, b, 1 / power))
+        likes = ((self.follows(a, b), a, b) for a, b in permutations(paths, 2))
+        found = [(like.correlation, a, b, 1 / by) for like, a, b in likes if (by := like.tenfold)]
         pairs: dict[str, tuple[str, float]] = {}
         for _, a, b, times in sorted(found, reverse=True):
             if not {one for q, (w, _) in pairs.items() for one in (q, w)} & {a, b}:
