@@ -9,6 +9,7 @@ One that acts on the rate of a joint with a constant inertia M of its own is M t
 from __future__ import annotations
 
 import copy
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,6 +23,7 @@ from grounded.adapters.mujoco_names import FIELDS, SLIDE_UNITS, states_of
 from grounded.diagnosis.parts import Estimate
 from grounded.effects import param_name
 from grounded.errors import needs
+from grounded.result import UNSAID, Document
 from grounded_trials.workspace.folder import Folder
 
 Lost = list[tuple[str, dict[str, Estimate]]]  # effects with their values
@@ -32,18 +34,29 @@ POSES = 8  # poses at which that is looked at
 HINGE, SLIDE, JOINT = 3, 2, 0  # mjtJoint, mjTRN_JOINT
 
 
-@dataclass(frozen=True)
-class Number:
-    """A number of the file with its value now."""
+@dataclass(frozen=True, eq=False)
+class Value(Document):
+    """A number of the exported file, and what it was in the file that the model came from."""
 
-    kind: str  # body, joint, actuator or geom
-    index: int  # of the element in MjModel
-    name: str  # of the element and the field, `elbow.damping`
-    field: str
-    value: float  # now
-    was: float  # in the file
+    value: float
     std: float  # NaN if it is not known
-    unit: str  # of the three
+    unit: str
+    was: float
+
+    @property
+    def text(self) -> str:
+        """The value with its +-."""
+        return Estimate(self.value, self.std, unit=self.unit).text
+
+
+@dataclass(frozen=True, eq=False)
+class Number(Value):
+    """A number of an MJCF or URDF file."""
+
+    kind: str = dataclasses.field(metadata=UNSAID)  # body, joint, actuator or geom
+    index: int = dataclasses.field(metadata=UNSAID)  # of the element in MjModel
+    name: str = dataclasses.field(metadata=UNSAID)  # of the element and the field, `elbow.damping`
+    field: str = dataclasses.field(metadata=UNSAID)
 
 
 class Held:
@@ -120,7 +133,7 @@ class Held:
             was, std = value_of(self.file, kind, index, field), math.sqrt(variance)
             name = f"{self._called(kind, index)}.{field}"
             unit = self._unit(kind, index, field)
-            found.append(Number(kind, index, name, field, was + by, was, std, unit))
+            found.append(Number(was + by, std, unit, was, kind, index, name, field))
         return tuple(found)
 
     # -- where an effect acts

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -46,37 +46,57 @@ LAGS = {0: "none", 2: "filter", 3: "filterexact"}  # mjtDyn
 
 
 class Mjcf:
-    """An MJCF file with what it includes, and the elements of its compiled model."""
+    """An MJCF file with what it includes, and the elements of its compiled model.
+
+    An element is found by its name, an actuator without one by its place. What the file makes in
+    another way (replicate, attach) is not written.
+    """
 
     def __init__(self, path: Path, compiled: Any) -> None:
         self.path, self.compiled = path, compiled
-        self.texts = dict[Path, XmlText]()
+        self.texts = {path: XmlText(path.read_bytes(), str(path))}
         self._includes = dict[Path, Element]()  # the element that names each included file
-        self.main = self._read(path)
-        tops = list(self._inside(self.main.root))
-        groups = (self._inside(one) for one in tops if one.tag == "actuator")
-        self.actuators = [one for group in groups for one in group]
-        self._read_all(tops)
+        self._elements = [*self._inside(self.texts[path].root, "mujoco")]
 
-    def element(self, kind: str, index: int) -> Element | None:
-        """Return the element of a body, joint, geom or actuator of the compiled model.
+    def _inside(self, element: Element, tag: str) -> Iterator[tuple[str, Element]]:
+        """Yield all elements in one with this tag, each after the tag of what it is in."""
+        for one in element:
+            if one.tag == "include":
+                path = (self.path.parent / one.get("file", "")).resolve()
+                if path not in self.texts:
+                    self._includes[path] = one
+                    self.texts[path] = XmlText(path.read_bytes(), str(path))
+                    yield from self._inside(self.texts[path].root, tag)
+            else:
+                yield tag, one
+                yield from self._inside(one, tag if one.tag == "frame" else str(one.tag))
 
-        It is found by its name, an actuator without one by its place. None if the file makes its
-        elements in another way (replicate, attach), or does not name them.
-        """
-        name = getattr(self.compiled, kind)(index).name
-        if kind == "actuator":
-            found = self.actuators
-        else:
-            found = [one for text in self.texts.values() for one in text.root.iter(kind)]
-        if name:
-            return next((one for one in found if one.get("name") == name), None)
-        one = found[index] if kind == "actuator" and index < len(found) else None
+    def _element(self, kind: str, index: int) -> Element | None:
+        name, acts = getattr(self.compiled, kind)(index).name, kind == "actuator"
+        found = [e for tag, e in self._elements if (tag if acts else e.tag) == kind]
+        if name or not acts:
+            return next((one for one in found if name and one.get("name") == name), None)
+        one = found[index] if index < len(found) else None
         return None if one is None or one.get("name") else one
 
-    def write(self, numbers: Sequence[Number]) -> list[Number]:
-        """Write numbers into the text; return those that have no place in it."""
-        return [one for one in numbers if not self._write(one)]
+    def write(self, number: Number) -> None:
+        """Write a number into the text, if it has a place there."""
+        element = self._element(number.kind, number.index)
+        if element is None:
+            return
+        if number.field == "mass":
+            self._mass(element, number)
+        elif number.field == "delay":
+            samples = math.ceil(number.value / self.compiled.opt.timestep - 1e-9) + 1
+            for name, new in (("delay", f"{number.value:.8g}"), ("nsample", f"{samples}")):
+                element.set(name, new)
+            element.set("interp", "linear")
+        elif own := OWN.get((str(element.tag), number.field)):
+            element.set(own, f"{number.value:.8g}")
+        elif number.kind == "actuator" and number.field != "gear":
+            self._general(element, number)
+        else:
+            self._first(element, number.field, number.value, number.index)
 
     def files(self, to: Path, comment: str) -> Mapping[Path, bytes]:
         """Return the contents of the file to write, and of changed ones that it includes.
@@ -85,47 +105,11 @@ class Mjcf:
         """
         found = dict[Path, bytes]()
         for path, text in reversed(self.texts.items()):  # an included file before what includes it
-            if path == self.path or not text.changed:
-                continue
-            there = to.with_name(f"{to.stem}-{path.name}")
-            found[there] = text.written()
-            include = self._includes[path]
-            include.set("file", there.name)
-        return {to: self.main.written(comment), **found}
-
-    def _read(self, path: Path) -> XmlText:
-        self.texts[path] = XmlText(path.read_bytes(), str(path))
-        return self.texts[path]
-
-    def _inside(self, element: Element) -> Iterator[Element]:
-        """Yield what is directly in an element, also by an include or in a frame."""
-        for one in element:
-            if one.tag == "include":
-                path = (self.path.parent / one.get("file", "")).resolve()
-                if path not in self.texts:
-                    self._includes[path] = one
-                    self._read(path)
-                yield from self._inside(self.texts[path].root)
-            elif one.tag == "frame":
-                yield from self._inside(one)
-            else:
-                yield one
-
-    def _read_all(self, elements: Iterable[Element]) -> None:
-        """Read the files that are included anywhere in some elements."""
-        for one in elements:
-            self._read_all(self._inside(one))
-
-    def _write(self, number: Number) -> bool:
-        element = self.element(number.kind, number.index)
-        if element is None:
-            return False
-        if number.field == "mass":
-            return self._mass(element, number)
-        if number.kind == "actuator":
-            return self._actuator(element, number)
-        self._first(element, number.field, number.value, number.index)
-        return True
+            if path != self.path and text.changed:
+                there = to.with_name(f"{to.stem}-{path.name}")
+                found[there] = text.written()
+                self._includes[path].set("file", there.name)
+        return {to: self.texts[self.path].written(comment), **found}
 
     def _first(self, element: Element, name: str, value: float, index: int) -> None:
         """Set the first number of an attribute."""
@@ -134,51 +118,31 @@ class Mjcf:
             rest = [f"{one:.12g}" for one in getattr(self.compiled, VECTORS[name])[index, 1:]]
         element.set(name, " ".join([f"{value:.8g}", *rest]))
 
-    def _mass(self, element: Element, number: Number) -> bool:
-        """Scale the mass and the inertia of a body."""
-        factor = number.value / number.was if number.was else 0.0  # a payload is a point
-        inertial = next((one for one in self._inside(element) if one.tag == "inertial"), None)
+    def _mass(self, element: Element, number: Number) -> None:
+        """Scale the mass and the inertia of a body; a payload without a mass is a point."""
+        factor = number.value / number.was if number.was else 0.0
+        inertial, model, i = element.find("inertial"), self.compiled, number.index
         if inertial is None:
-            model, i = self.compiled, number.index
             row = {
                 "pos": model.body_ipos[i],
                 "quat": model.body_iquat[i],
-                "mass": [number.value],
                 "diaginertia": np.maximum(model.body_inertia[i] * factor, POINT),
             }
             inertial = first_child(element, "inertial")
             for name, each in row.items():
                 inertial.set(name, " ".join(f"{x:.10g}" for x in each))
-            return True
-        inertial.set("mass", f"{number.value:.8g}")
-        for name in ("diaginertia", "fullinertia"):
-            if given := inertial.get(name):
-                scaled = np.array(given.split(), float) * factor
+        else:
+            for name in {"diaginertia", "fullinertia"} & {*inertial.keys()}:
+                scaled = np.array(inertial.attrib[name].split(), float) * factor
                 inertial.set(name, " ".join(f"{x:.10g}" for x in scaled))
-        return True
+        inertial.set("mass", f"{number.value:.8g}")
 
-    def _actuator(self, element: Element, number: Number) -> bool:
-        field, value = number.field, number.value
-        if field == "delay":
-            samples = math.ceil(value / self.compiled.opt.timestep - 1e-9) + 1
-            for name, new in (("delay", f"{value:.8g}"), ("nsample", f"{samples}")):
-                element.set(name, new)
-            element.set("interp", "linear")
-            return True
-        if field == "gear":
-            self._first(element, "gear", value, number.index)
-            return True
-        if own := OWN.get((element.tag, field)):
-            element.set(own, f"{value:.8g}")
-            return True
-        return self._general(element, number)
-
-    def _general(self, element: Element, number: Number) -> bool:
+    def _general(self, element: Element, number: Number) -> None:
         """Write a gain, a lag or a fed-back gain as the attributes of a `general` actuator."""
         model, i = self.compiled, number.index
         kinds = model.actuator_gaintype[i], model.actuator_biastype[i], model.actuator_dyntype[i]
         if element.tag not in SHORTCUTS or max(kinds[:2]) > 1 or int(kinds[2]) not in LAGS:
-            return False
+            return
         if element.tag != "general":
             for name in SHORTCUTS[element.tag]:
                 element.attrib.pop(name, None)
@@ -187,14 +151,13 @@ class Mjcf:
         if number.field == "lag":
             element.set("dyntype", "filterexact")
             element.set("dynprm", f"{number.value:.8g}")
-            return True
+            return
         for array, column, factor in FIELDS[number.field].places:
             name = array.removeprefix("actuator_")
             given = element.get(name, "").split() or _trimmed(getattr(model, array)[i])
             given += ["0"] * (int(column or 0) + 1 - len(given))
             given[int(column or 0)] = f"{factor * number.value:.8g}"
             element.set(name, " ".join(given))
-        return True
 
     def _typed(self, element: Element, i: int) -> None:
         """Say in a `general` element what its shortcut said."""
@@ -223,41 +186,27 @@ class Urdf:
     def __init__(self, path: Path) -> None:
         self.text = XmlText(path.read_bytes(), str(path))
 
-    def write(self, numbers: Sequence[Number]) -> list[Number]:
-        """Write numbers into the text; return those that have no place in it."""
-        return [one for one in numbers if not self._write(one)]
+    def write(self, number: Number) -> None:
+        """Write a number into the text, if it has a place there."""
+        name, _, field = number.name.rpartition(".")
+        tag = "link" if field == "mass" else "joint"
+        element = next((e for e in self.text.root.findall(tag) if e.get("name") == name), None)
+        if element is None:
+            return
+        if attribute := DYNAMICS.get(field):
+            dynamics = element.find("dynamics")
+            if dynamics is None:
+                dynamics = first_child(element, "dynamics")
+            dynamics.set(attribute, f"{number.value:.8g}")
+        elif (mass := element.find("inertial/mass")) is not None:
+            factor = number.value / number.was if number.was else 1.0
+            mass.set("value", f"{number.value:.8g}")
+            for inertia in element.findall("inertial/inertia"):
+                inertia.attrib = {n: f"{float(v) * factor:.10g}" for n, v in inertia.items()}
 
     def files(self, to: Path, comment: str) -> Mapping[Path, bytes]:
         """Return the contents of the file to write."""
         return {to: self.text.written(comment)}
-
-    def _write(self, number: Number) -> bool:
-        name, _, field = number.name.rpartition(".")
-        if field == "mass":
-            return self._mass(self._named("link", name), number)
-        joint, attribute = self._named("joint", name), DYNAMICS.get(field)
-        if joint is None or attribute is None:
-            return False
-        dynamics = joint.find("dynamics")
-        if dynamics is None:
-            dynamics = first_child(joint, "dynamics")
-        dynamics.set(attribute, f"{number.value:.8g}")
-        return True
-
-    def _named(self, tag: str, name: str) -> Element | None:
-        return next((e for e in self.text.root.findall(tag) if e.get("name") == name), None)
-
-    def _mass(self, link: Element | None, number: Number) -> bool:
-        """Scale the mass and the inertia of a link."""
-        mass = None if link is None else link.find("inertial/mass")
-        if link is None or mass is None:
-            return False
-        factor = number.value / number.was if number.was else 1.0
-        mass.set("value", f"{number.value:.8g}")
-        inertia = link.find("inertial/inertia")
-        if inertia is not None:
-            inertia.attrib = {n: f"{float(v) * factor:.10g}" for n, v in inertia.items()}
-        return True
 
 
 # an XML file whose comments, order and layout of elements stay

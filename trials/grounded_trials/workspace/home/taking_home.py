@@ -28,26 +28,11 @@ from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.adopted import installed_effects
 from grounded_trials.workspace.adoption import known_values
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.home.held import Held, Number, value_of
+from grounded_trials.workspace.home.held import Held, Number, Value, value_of
 from grounded_trials.workspace.home.mjcf import Mjcf, Urdf, XmlText, commented
 from grounded_trials.workspace.user_files.model_file import load_module
 
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
-
-
-@dataclass(frozen=True, eq=False)
-class Value(Document):
-    """A number of the exported file, and what it was in the file that the model came from."""
-
-    value: float
-    std: float
-    unit: str
-    was: float
-
-    @property
-    def text(self) -> str:
-        """The value with its +-."""
-        return Estimate(self.value, self.std, unit=self.unit).text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,27 +75,25 @@ def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
     """Write an MJCF or URDF file."""
     held, open_ = Held.of(workspace, known_values(workspace))
     lost = [_not_held(name, c) for name, c in open_]
-    dropped = list[Number]()
     urdf = XmlText(source.read_bytes(), str(source)).root.tag == "robot"
-    for _ in range(2):  # again without what the written file does not compile to
+    numbers = {one.name: one for one in held.numbers}
+    while True:  # again without what the written file does not compile to
+        date, comment = _comment(workspace, numbers, lost)
         form = Urdf(source) if urdf else Mjcf(source, held.file)
-        dropped += form.write([one for one in held.numbers if one not in dropped])
-        numbers = [one for one in held.numbers if one not in dropped]
-        taken = {n.name: Value(n.value, n.std, n.unit, n.was) for n in numbers}
-        texts = {n.name: Estimate(n.value, n.std, unit=n.unit).text for n in dropped}
-        told = [*lost, *(finding("model.no_place", n, value=text) for n, text in texts.items())]
-        date, comment = _comment(workspace, taken, told)
+        for one in numbers.values():
+            form.write(one)
         files = form.files(path, commented(comment))
-        if not (missed := _missed(source, path, files, numbers)):
+        missed = _missed(source, path, files, [*numbers.values()])
+        lost += [finding("model.no_place", n.name, value=numbers.pop(n.name).text) for n in missed]
+        if not missed:
             break
-        dropped += missed
     for name, data in files.items():
         write_atomically(name, data)
     if path.resolve().parent != source.parent:
         beside = [os.path.relpath(one, source.parent) for one in files_of(source)[1:]]
-        told += [finding("model.reads", *sorted(beside))] if beside else []
+        lost += [finding("model.reads", *sorted(beside))] if beside else []
     others = tuple(name for name in files if name != path)
-    return TakenHome(path, source, date, taken, settle(told), others)
+    return TakenHome(path, source, date, {**numbers}, settle(lost), others)
 
 
 def _not_held(effect: str, c: Mapping[str, Estimate]) -> Finding:
