@@ -50,13 +50,7 @@ def write_cases(
     """Write the workspaces and labels of all cases, then the manifest; return the cases' names.
 
     The manifest is written last: a folder without one was interrupted, and writing the same cases
-    again continues there.
-
-    Args:
-        cases: the cases, each with its trials and its label.
-        folder: receives the workspaces and the manifest.
-        labels: receives the labels; must lie outside `folder`.
-        tick: called with the number of cases written so far.
+    again continues there. The labels must lie outside the folder; `tick` gets the number of cases.
     """
     if (folder / MANIFEST).exists():
         raise refused("file.exists", folder / MANIFEST)
@@ -147,15 +141,7 @@ def diagnose_cases(
     engine: Engine | None = None,
     progress: Progress | None = None,
 ) -> dict[str, float]:
-    """Diagnose every case that has no diagnosis yet; return the CPU time [s] by case.
-
-    Args:
-        folder: the challenge.
-        without: effect families of the built-in library to exclude.
-        again: also repeat the diagnoses that exist.
-        engine: where the jobs run.
-        progress: called with the number of jobs done and the total.
-    """
+    """Diagnose the cases without a diagnosis, or `again` all; return the CPU time [s] by case."""
     every = read_manifest(folder)
     names = [n for n in every if again or not (folder / n / "reports" / DIAGNOSIS).is_file()]
     where = {"folder": str(folder.resolve()), "without": list(without)}

@@ -21,12 +21,7 @@ NO_LINKS = getattr(os, "O_NOFOLLOW", 0)
 
 
 def open_file(path: Path, *, follow: bool = True) -> BufferedReader:
-    """Open a regular file for reading, without blocking.
-
-    Args:
-        path: the file.
-        follow: whether symbolic links are followed; False refuses them.
-    """
+    """Open a regular file for reading, without blocking; links are followed or refused."""
     if not follow and path.is_symlink():
         raise unreadable(path, "link")
     descriptor = os.open(path, os.O_RDONLY | PLAIN | (0 if follow else NO_LINKS))

@@ -31,13 +31,7 @@ class Table:
         self.values, self.file, self.where = dict(values), file, where
 
     def error(self, key: str, must: str, value: object = None) -> GroundedError:
-        """Return an error about one key.
-
-        Args:
-            key: of this table.
-            must: what its value must be: a word of the entry `given.value`.
-            value: what was found, None if the key is missing.
-        """
+        """Return an error about one key: what its value must be, a word of `given.value`."""
         given = "" if value is None else str(value) if isinstance(value, float) else repr(value)
         return wrong(self._full(key), got=given, must=must, where=self.file.name)
 
@@ -55,11 +49,8 @@ class Table:
     def take(self, key: str, kind: Any, default: Any = None) -> Any:
         """Return the value of a key, or the default if it is absent.
 
-        Args:
-            key: of this table.
-            kind: a type (an integer is accepted as a float), one with None, a Literal, or a Mapping
-                of names to numbers.
-            default: its value if the key is absent.
+        `kind` is a type (an integer is accepted as a float), one with None, a Literal, or a Mapping
+        of names to numbers.
         """
         if get_origin(kind) is Mapping:
             return self.sub(key).numbers()
@@ -87,9 +78,7 @@ class Table:
     def into(self, kind: type[T], **read: Any) -> T:
         """Return the table as a dataclass; keys that are none of its fields are errors.
 
-        Args:
-            kind: its fields are of the kinds that `take` knows.
-            **read: values of fields that are read in another way.
+        Its fields are of the kinds that `take` knows, but those in `read`, which are given.
         """
         types, found = _types(cast(Any, kind)), dict(read)
         self.expect(types)

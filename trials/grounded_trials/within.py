@@ -83,15 +83,10 @@ class _Limits:
 def within(
     name: str | Path, size: int, function: Callable[P, T], *args: P.args, **kwargs: P.kwargs
 ) -> T:
-    """Return function(...), computed in a child process with limits for a file of this size.
+    """Return function(...), computed in a child process with limits for a file of `size` bytes.
 
-    Args:
-        name: of the log, for the message.
-        size: of its files [bytes].
-        function: reads the log; what it returns is pickled, and what it modifies stays unmodified
-            here. Files that it writes to the temporary folder are deleted.
-        *args: its arguments.
-        **kwargs: its named arguments.
+    What it returns is pickled, and what it modifies stays unmodified here. Files that it writes to
+    the temporary folder are deleted. `name` is that of the log, for the message.
     """
     if _inside or not FORKS:
         return function(*args, **kwargs)

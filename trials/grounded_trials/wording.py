@@ -113,12 +113,7 @@ def glued(text: str) -> str:
 
 
 def rendered(then: NextCommand, folder: str | None = None) -> str:
-    """Return a command for the shell: `grounded run c0003`, with `-C DIR` if a folder is given.
-
-    Args:
-        then: the command as data.
-        folder: the workspace as the user named it, None for the current folder.
-    """
+    """Return a command for the shell, `grounded run c0003`, with `-C DIR` if a folder is given."""
     words = ["grounded", *(["-C", folder] if folder is not None else []), then.verb]
     return shlex.join([*words, *then.arguments])
 
@@ -152,11 +147,6 @@ def folded(command: str) -> str:
 
 
 def what_became(gone: Collection[str], aside: Collection[str]) -> str:
-    """Return what became of trials that are used no more: "set aside", or lost without a word.
-
-    Args:
-        gone: the trials.
-        aside: those that the user has set aside.
-    """
+    """Return what became of trials that are used no more: "set aside", or lost without a word."""
     lost = [name for name in gone if name not in aside]
     return f"set aside, or missing in trials/ ({', '.join(lost)})" if lost else "set aside"

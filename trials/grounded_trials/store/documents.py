@@ -59,13 +59,7 @@ def read_document(path: Path) -> dict[str, Any]:
 
 
 def read_as(path: Path, kind: type[D], **facts: Any) -> D | None:
-    """Read a document as a type; return None if there is no such file.
-
-    Args:
-        path: the file.
-        kind: the type that wrote it, maybe of another version.
-        **facts: what the error says besides, see `unreadable`.
-    """
+    """Read a document as a type; None if there is no such file; `facts` see `unreadable`."""
     try:
         return kind.from_json(read_document(path))
     except FileNotFoundError:
@@ -81,12 +75,7 @@ class Notes:
         self.store = Store(folder, prefix="n")
 
     def add(self, note: Mapping[str, str], *, again: bool = True) -> None:
-        """Add a note.
-
-        Args:
-            note: its contents.
-            again: add it even if an equal note exists.
-        """
+        """Add a note; an equal one is not repeated unless `again`."""
         with self.adding(note, again=again):
             pass
 
@@ -98,11 +87,7 @@ class Notes:
             yield
 
     def read(self, lost: list[Lost] | None = None) -> Iterator[dict[str, str]]:
-        """Yield all notes in order of creation.
-
-        Args:
-            lost: damaged notes are appended to it; None: they raise an error.
-        """
+        """Yield all notes in order of creation; damaged ones are added to `lost`, else raised."""
         for entry in self.store.list():
             try:
                 note: dict[str, str] = json.loads(self.store.read(entry))

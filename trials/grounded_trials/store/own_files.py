@@ -192,13 +192,7 @@ def format_of(path: Path) -> str:
 
 
 def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
-    """Read and check a trial or candidate file.
-
-    Args:
-        source: its path, or its bytes.
-        name: name of the file in messages, if `source` is bytes.
-        kind: the required format, `TRIAL` or `CANDIDATE`.
-    """
+    """Read and check a file of a kind, `TRIAL` or `CANDIDATE`: of a path, or bytes with a name."""
     if not isinstance(source, bytes):
         name, source = str(source), read_file(Path(source), FILE_LIMIT)
     meta: dict[str, str] | None = None
@@ -233,16 +227,7 @@ def _type(topic: Topic, name: str) -> Schema:
 def stated(
     kind: str, dt: float, states: Units, inputs: Units, meta: Meta, **more: str
 ) -> dict[str, str]:
-    """Return the metadata record of a file.
-
-    Args:
-        kind: the format, `TRIAL` or `CANDIDATE`.
-        dt: control interval [s].
-        states: name -> unit, in array order.
-        inputs: name -> unit, in array order.
-        meta: the caller's own entries.
-        **more: the entries that only this format has.
-    """
+    """Return the metadata record of a file: what is always there, `more`, and `meta`."""
     for key in meta:
         if key in RESERVED:
             raise wrong("metadata", key, must="free")

@@ -121,15 +121,10 @@ class Store:
         return data
 
     def add(self, data: bytes, suffix: str = ".mcap", *, again: bool = False) -> Added:
-        """Add a file; equal contents are stored once, unless `again`.
+        """Add a file; equal contents are stored once, unless `again`: a run may repeat another.
 
         On return, the contents are synced to disk. If the stored file with this hash is damaged, it
         is replaced; the damaged file is kept as `NAME.damaged`.
-
-        Args:
-            data: its contents.
-            suffix: suffix of its name in the store.
-            again: store equal contents as a new file, for a run that repeats another bit by bit.
         """
         digest = hashlib.sha256(data).hexdigest()
         with self.locked():

@@ -194,10 +194,8 @@ class Folder:
     def read(self, *, strict: bool = True) -> Contents:
         """Read the trials, and the search's candidates for the current task.
 
-        Probes and candidates of an earlier task (other target, reward, limits) are left out.
-
-        Args:
-            strict: raise for damaged files; else they are left out and named in `lost`.
+        Probes and candidates of an earlier task (other target, reward, limits) are left out. So are
+        damaged files, named in `lost`, unless `strict`, which raises for them.
         """
         names = self.names()
         if names not in self._contents:
@@ -242,11 +240,7 @@ class Folder:
         return same and abs(trial.dt - self.config.task.dt) < 1e-9
 
     def task_trials(self, *, measured: bool = False) -> list[Trial]:
-        """Return the trials that fit this task.
-
-        Args:
-            measured: return them as logged; else short gaps are bridged.
-        """
+        """Return the trials that fit this task, as logged or with short gaps bridged."""
         return [t.measured if measured else t.trial for t in self.trials() if self.fits(t.trial)]
 
     def candidate_path(self, identity: str) -> Path:
@@ -258,11 +252,7 @@ class Folder:
         return self._ids(self.trials())
 
     def next_id(self, *, handed: bool = False) -> str:
-        """Return the name of the next candidate.
-
-        Args:
-            handed: skip names that were handed out even if their files are gone.
-        """
+        """Return the name of the next candidate; `handed`: none that was handed out before."""
         ids = self.candidate_ids()
         if handed:
             ids = sorted({*ids, *self.noted.handed}, key=lambda name: int(name[1:]))
@@ -299,14 +289,8 @@ class Folder:
     ) -> Candidate | None:
         """Write candidates/cNNNN.mcap atomically; existing files are never replaced.
 
-        Args:
-            candidate: a new candidate.
-            seen: the `names` that existed when it was planned; None: do not compare them.
-            kind: "search" or "probe".
-
-        Returns:
-            The candidate, under a later name if its own was handed out for another policy. None if
-            trials or candidates were added meanwhile: it must be planned again.
+        Returns the candidate, under a later name if its own was handed out for another policy. None
+        if trials or candidates were added since it was planned with the `names` `seen`.
         """
         data = encoded(candidate, self.task, kind)
         if sha256(data) not in self.noted.handed.get(candidate.id, {sha256(data)}):

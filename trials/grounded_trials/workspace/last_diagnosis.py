@@ -78,13 +78,9 @@ def usable_ids(workspace: Folder) -> list[str]:
 
 
 def chosen(workspace: Folder, names: Sequence[str] = ()) -> Share:
-    """Return the trials to fit or to diagnose, or a share of them.
+    """Return the named trials, or all usable ones, to fit or to diagnose; or a share of them.
 
     States that were filled in by a smoother are no evidence: NaN again.
-
-    Args:
-        workspace: the workspace.
-        names: short names of the trials; empty: all usable ones.
     """
     from grounded.share import share_of
 

@@ -66,12 +66,8 @@ class OffTarget(Document):
 def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     """Return how far the runs of one candidate are off the target, the position first.
 
-    Args:
-        task: the task with the target and the weights.
-        trials: runs of the candidate; they may end early, or have no known state at all.
-
-    Returns:
-        The errors of the groups that matter most; () if nothing is tracked.
+    That are the errors of the groups that matter most; () if nothing is tracked. Runs may end
+    early, or have no known state at all.
     """
     whole = [trial.whole(task.horizon) for trial in trials]
     errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]

@@ -104,12 +104,7 @@ def taken_out(workspace: Folder) -> dict[str, float]:
 
 
 def twice_in_time(workspace: Folder, effects: Effects | None = None) -> Said | None:
-    """Return that [log] now removes delays that the model has as well.
-
-    Args:
-        workspace: the workspace with [log].
-        effects: the model's effects; None for those that are adopted.
-    """
+    """Return that [log] now removes delays that the adopted, or other, effects have as well."""
     effects = workspace.config.model.effects if effects is None else effects
     named = {n.removeprefix(SENSOR_DELAY): one for n, one in effects.items() if SENSOR_DELAY in n}
     late = {n: one.get("d", 0.0) for n, one in named.items()}

@@ -108,19 +108,16 @@ DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics 
 
 
 def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
-    """Find states and inputs inside the limits under which the robot rests at its start.
+    """Find states and inputs (n + m,) inside the limits under which the robot rests at its start.
 
-    The clock states of effects that grow with time are ignored: they always move.
+    None if it rests under the input held before already, or if no input holds it because the start
+    is in motion. The clock states of effects that grow with time are ignored: they always move.
 
     Args:
         task: the task with the start.
         free: (n,), states that may differ from the start.
         loose: the task with softened dry friction, used for the search: with sticking friction the
             robot would rest under almost any input.
-
-    Returns:
-        States and inputs (n + m,); None if the robot rests under the input held before already, or
-        if no input holds it because the start is in motion.
     """
     clocks = free & [is_clock(name) for name in task.model.state_names]
     free, away = free & ~clocks, np.abs(moved_at_start(task, task.past))[~clocks].max()
@@ -150,11 +147,9 @@ def moved_at_start(task: Task, inputs: Array) -> Array:
 
 
 def rest_of_trials(workspace: Folder) -> tuple[dict[str, float], str]:
-    """Return where the robot rests at the start of the first stored trial that begins at rest.
+    """Return the values for [task] start by the first stored trial that begins at rest; its id.
 
-    Returns:
-        The values for [task] start that are not zero, inputs that hold it included, and the trial;
-        ({}, "") if [task] start has values, or no trial tells.
+    Inputs that hold it are included; ({}, "") if [task] start has values, or no trial tells.
     """
     try:
         trials = [] if workspace.config.task.start else workspace.task_trials()

@@ -40,11 +40,8 @@ def standing_in(
 ) -> Standing:
     """Return the standing of the search in a workspace.
 
-    Args:
-        workspace: the workspace with the trials and candidates.
-        ahead: also plan the next candidate, without writing it, which shows whether the search has
-            anything left to gain.
-        contents: the contents of the folder, if they were read already.
+    `ahead` also plans the next candidate, without writing it, which shows whether the search has
+    anything left to gain.
     """
     contents = contents or workspace.read()
     now = standing_of(workspace, contents)

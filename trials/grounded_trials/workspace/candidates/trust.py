@@ -95,12 +95,7 @@ def promises(
 ) -> dict[str, Finding]:
     """Return what is told of a candidate, by the label of its line.
 
-    Args:
-        workspace: the workspace with the trials.
-        made: the candidate.
-        now: the standing of the search.
-        cost: of the sensor noise in its log that its prediction lacks.
-        whole: of all of the sensor noise in its log.
+    `cost` is that of the sensor noise in its log that its prediction lacks, `whole` of all of it.
     """
     promised, best = made.predicted_utility, now.incumbent
     in_log = promised - cost

@@ -65,13 +65,7 @@ class Held:
     def __init__(
         self, stepper: MujocoStepper, file: Any, params: Mapping[str, tuple[float, float]]
     ) -> None:
-        """Start with the model's own parameters.
-
-        Args:
-            stepper: of the model.
-            file: its file as it is, compiled.
-            params: value and standard deviation of each parameter.
-        """
+        """Start with the model's own parameters: value and standard deviation of each."""
         self.mj, self.stepper, self.file = needs("mujoco"), stepper, file
         self.now = copy.deepcopy(self.file)
         self._delta = dict[Key, tuple[float, float]]()  # what is added, and its variance

@@ -242,8 +242,7 @@ def set_target(
         usual: the weights that the previous target gave.
         changes: by input, its weight on changes without [limits], and with them.
         terminal: weights for [reward] terminal of states that have none there.
-        left: states that had a column in the previous target and have none now. Weights that they
-            have at the end alone go with it, if weights are renewed.
+        left: states with a column in the previous target alone, whose weights at the end go too.
     """
     import tomlkit
 

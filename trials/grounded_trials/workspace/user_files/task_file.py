@@ -117,9 +117,7 @@ CHANGES = 4 * CHANGE
 def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Array]:
     """Read the names of the columns (`t` first) and their values, (rows, columns).
 
-    Args:
-        path: the CSV file.
-        free: names of columns that may hold NaN: of inputs, beside the states of a run.
+    Columns of inputs, beside the states of a run, are `free` to hold NaN.
     """
     try:
         with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
