@@ -12,15 +12,22 @@ optimum of a search that knows the real car. One repetition without scatter show
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from grounded.engine import Engine
 from grounded.experiments.car_tasks import NAMES, car_task
-from grounded.experiments.jobs import Progress, StudyTable, improvement, mean_text, run_jobs
+from grounded.experiments.jobs import (
+    Progress,
+    Study,
+    StudyTable,
+    improvement,
+    mean_text,
+    run_jobs,
+)
 from grounded.experiments.real_car import LATENCY, real_car, real_plant
 from grounded.models.car import model as car
 from grounded.plant import Plant
@@ -34,63 +41,7 @@ PAPER = {"turn": 0.97, "circle": 0.88, "figure8": 0.63}
 ITERATIONS = 10  # "after 5-10 iterations"
 BUDGET = 40
 FRESH = 30
-
-
-@dataclass(frozen=True)
-class CarRun:
-    """One repetition. `utilities` are measured in its trials, `true` are means of fresh runs."""
-
-    manoeuvre: str
-    seed: int
-    noisy: bool
-    utilities: tuple[float, ...]
-    true: tuple[float, float]  # of the model's policy and of the final one
-    optimum: float
-    trials: int
-    alphas: tuple[float, ...]
-
-    @property
-    def improvement(self) -> float:
-        """Improvement of the true utility."""
-        return improvement(*self.true)
-
-
-@dataclass(frozen=True)
-class CarResult:
-    """All repetitions."""
-
-    runs: tuple[CarRun, ...]
-
-    def of(self, manoeuvre: str, noisy: bool) -> list[CarRun]:
-        """Return the repetitions of one manoeuvre."""
-        return [run for run in self.runs if (run.manoeuvre, run.noisy) == (manoeuvre, noisy)]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `grounded experiment car --json`, a row per run."""
-        runs = [vars(run) | {"improvement": run.improvement} for run in self.runs]
-        return {"runs": runs, "paper": PAPER}
-
-    def tables(self) -> list[StudyTable]:
-        """Return improvement and trials beside the paper's, without and with scatter."""
-        found = []
-        for noisy, title in ((False, "RC car that repeats itself"), (True, "RC car with scatter")):
-            some = [run for run in self.runs if run.noisy == noisy]
-            names = dict.fromkeys(run.manoeuvre for run in some)
-            rows = tuple((n, *_cells(self.of(n, noisy)), f"{PAPER[n]:.0%}") for n in names)
-            trials = "trials an iteration" if noisy else "trials"
-            head = ("manoeuvre", "improvement", "the optimum's", trials, "the paper's car")
-            title = f"{title}, up to {ITERATIONS} iterations"
-            found += [StudyTable(title, head, rows)] if rows else []
-        return found
-
-
-def _cells(runs: list[CarRun]) -> tuple[str, str, str]:
-    best = np.mean([improvement(run.true[0], run.optimum) for run in runs])
-    shown = mean_text([run.improvement for run in runs])
-    if not runs[0].noisy:
-        return shown, f"{best:.1%}", f"{runs[0].trials}"
-    each = np.mean([run.trials / max(len(run.utilities), 1) for run in runs])
-    return shown, f"{best:.1%}", f"{each:.1f}"
+Row = dict[str, Any]  # of one repetition
 
 
 def run(
@@ -99,7 +50,7 @@ def run(
     manoeuvres: Sequence[str] = NAMES,
     engine: Engine | None = None,
     progress: Progress | None = None,
-) -> CarResult:
+) -> Study:
     """Run every manoeuvre once without scatter, and with scatter once for each seed."""
     cases = (
         {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy}
@@ -107,11 +58,33 @@ def run(
         for noisy, some in ((False, [0]), (True, seeds))
         for seed in some
     )
-    return CarResult(tuple(run_jobs(car_job, cases, engine, progress)))
+    rows = run_jobs(car_job, cases, engine, progress)
+    return Study({"runs": rows, "paper": PAPER}, tuple(_tables(rows)))
 
 
-def car_job(manoeuvre: str, seed: int, noisy: bool) -> CarRun:
-    """Run one job: one repetition of one manoeuvre."""
+def _tables(rows: list[Row]) -> Iterator[StudyTable]:
+    """Yield improvement and trials beside the paper's, without and with scatter."""
+    for noisy, title in ((False, "RC car that repeats itself"), (True, "RC car with scatter")):
+        lines = []
+        for name in dict.fromkeys(row["manoeuvre"] for row in rows if row["noisy"] == noisy):
+            runs = [row for row in rows if (row["manoeuvre"], row["noisy"]) == (name, noisy)]
+            best = np.mean([improvement(row["true"][0], row["optimum"]) for row in runs])
+            each = np.mean([row["trials"] / max(len(row["utilities"]), 1) for row in runs])
+            trials = f"{each:.1f}" if noisy else f"{runs[0]['trials']}"
+            shown = mean_text([row["improvement"] for row in runs])
+            lines.append((name, shown, f"{best:.1%}", trials, f"{PAPER[name]:.0%}"))
+        trials = "trials an iteration" if noisy else "trials"
+        head = ("manoeuvre", "improvement", "the optimum's", trials, "the paper's car")
+        if lines:
+            yield StudyTable(f"{title}, up to {ITERATIONS} iterations", head, tuple(lines))
+
+
+def car_job(manoeuvre: str, seed: int, noisy: bool) -> Row:
+    """Run one job: one repetition of one manoeuvre.
+
+    `utilities` are measured in its trials; `true` are means of fresh runs of the model's policy and
+    of the final one, and `improvement` is theirs.
+    """
     task, plant, trials = car_task(manoeuvre, car), real_plant(noisy), list[Trial]()
     start = dict(zip(car.state_names, map(float, task.start), strict=True))
 
@@ -139,6 +112,7 @@ def car_job(manoeuvre: str, seed: int, noisy: bool) -> CarRun:
         runs = range(FRESH if noisy else 1)
         fresh = [task.utility(driven(plant, candidate.policy, 7, i)) for i in runs]
         true.append(float(np.mean(np.maximum(fresh, still))))
-    utilities, alphas = tuple(found.standing.utilities), tuple(c.alpha for c in found.candidates)
-    run = (manoeuvre, seed, noisy, utilities, (true[0], true[1]), true[2], len(trials), alphas)
-    return CarRun(*run)
+    row: Row = {"manoeuvre": manoeuvre, "seed": seed, "noisy": noisy}
+    row |= {"utilities": list(found.standing.utilities), "true": true[:2], "optimum": true[2]}
+    row |= {"trials": len(trials), "alphas": [one.alpha for one in found.candidates]}
+    return row | {"improvement": improvement(*true[:2])}

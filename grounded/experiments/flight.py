@@ -12,7 +12,6 @@ parameters, which the search never sees.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -23,6 +22,7 @@ from grounded.engine import Engine
 from grounded.experiments.figure8 import RADIUS, flight_task, perturbed
 from grounded.experiments.jobs import (
     Progress,
+    Study,
     StudyTable,
     improvement,
     mean_se,
@@ -51,73 +51,7 @@ PAPER = {
 }
 
 
-@dataclass(frozen=True)
-class FlightRun:
-    """One approximate model. Utilities: of the model's policy, then after each improvement."""
-
-    seed: int
-    discarded: bool
-    utilities: tuple[float, ...]
-    trials: int
-    alphas: tuple[float, ...]  # of every trial; the first is the model's own policy
-
-    @property
-    def improvement(self) -> float:
-        """Share of the model-based cost that is gone."""
-        return improvement(self.utilities[0], self.utilities[-1])
-
-
-@dataclass(frozen=True)
-class FlightResult:
-    """Table 1."""
-
-    runs: tuple[FlightRun, ...]
-    optimum: float
-
-    @property
-    def flown(self) -> tuple[FlightRun, ...]:
-        """The runs that were not discarded."""
-        return tuple(run for run in self.runs if not run.discarded)
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the document of `grounded experiment flight --json`: a row per run, and means."""
-        flown = self.flown
-        first, last = ([run.utilities[k] for run in flown] for k in (0, -1))
-        mean, se = mean_se([run.improvement for run in flown])
-        ratio = improvement(float(np.mean(first)), float(np.mean(last)))
-        each = [(run.trials - 1) / max(len(run.utilities) - 1, 1) for run in flown]
-        return document(
-            runs=[vars(run) | {"optimum": self.optimum} for run in self.runs],
-            model_based=mean_se(first),
-            learned=mean_se(last),
-            optimum=self.optimum,
-            worst_gap_to_optimum=max((self.optimum - u) / -self.optimum for u in last),
-            improvement={"mean": mean, "se": se, "ratio_of_means": ratio},
-            trials=float(np.mean([run.trials for run in flown])),
-            trials_an_iteration=float(np.mean(each)),
-            discarded=len(self.runs) - len(flown),
-            paper=PAPER,
-        )
-
-    def tables(self) -> list[StudyTable]:
-        """Return Table 1 beside the paper's."""
-        found = self.to_json()
-        first, last = (mean_text([run.utilities[k] for run in self.flown], ",.0f") for k in (0, -1))
-        gain = mean_text([run.improvement for run in self.flown])
-        rows = (
-            ("utility, model-based", first, "-13,028 (±330)"),
-            (f"utility, up to {ITERATIONS} iterations", last, "-3,000 (±100)"),
-            ("improvement, mean of ratios", gain, "76 % (±2 %)"),
-            ("improvement, ratio of means", f"{found['improvement']['ratio_of_means']:.1%}", ""),
-            ("optimum with the true parameters", f"{self.optimum:,.0f}", "not given"),
-            ("largest distance to it", f"{found['worst_gap_to_optimum']:.2%}", "not given"),
-            ("trials an iteration", f"{found['trials_an_iteration']:.2f}", "typically 1"),
-            ("discarded", f"{found['discarded']} of {len(self.runs)}", "about 20 %"),
-        )
-        many = f"{len(self.flown)} runs, mean (± one standard error)"
-        runs = many if len(self.flown) > 1 else "one run"
-        title = f"Table 1: flight simulator, {runs}"
-        return [StudyTable(title, ("", "here", "paper"), rows)]
+Row = dict[str, Any]  # of one approximate model
 
 
 def run(
@@ -126,7 +60,7 @@ def run(
     first_seed: int = 0,
     engine: Engine | None = None,
     progress: Progress | None = None,
-) -> FlightResult:
+) -> Study:
     """Make Table 1 from `count` runs that are not discarded, seeds first_seed, first_seed + 1 ...
 
     Args:
@@ -138,33 +72,73 @@ def run(
     Raises:
         GroundedError: if more than four of five models are discarded.
     """
-    found: list[FlightRun] = []
-    while missing := count - sum(not r.discarded for r in found):
+    found: list[Row] = []
+    while missing := count - sum(not row["discarded"] for row in found):
         if len(found) >= 5 * count:
             raise wrong("flyable models", len(found), low=count)
         seed = first_seed + len(found)
         cases = ({"seed": s} for s in range(seed, seed + missing))
         found += run_jobs(flight_job, cases, engine, progress)
     _, optimum = first_policy(flight_task(aircraft))
-    return FlightResult(tuple(found), -optimum.cost)
+    return _table_1(found, -optimum.cost)
 
 
-def flight_job(seed: int) -> FlightRun:
-    """Run one job: one approximate model, five iterations."""
+def flight_job(seed: int) -> Row:
+    """Run one job: one approximate model, five iterations.
+
+    `utilities`: of the model's policy, then after each improvement. `alphas` of every trial; the
+    first is the model's own policy.
+    """
     truth = flight_task(aircraft)
     crude = perturbed(aircraft, np.random.default_rng(seed))
     task = flight_task(crude, started_by=aircraft)
     options = SearchOptions()
     first = propose(task, [], [], options).candidate
     flown = None if first is None else real_flight(truth, first)
-    if flown is None or unstable(truth, flown):
+    row: Row = {"seed": seed, "discarded": flown is None or unstable(truth, flown)}
+    if row["discarded"]:
         claimed = plain([truth.utility(flown)] if flown else [])  # JSON has no infinity
-        return FlightRun(seed, True, tuple(claimed), 1, (1.0,))
+        return row | {"utilities": claimed, "trials": 1, "alphas": [1.0]}
     fly = partial(real_flight, truth)
     found = learn(task, fly, options, max_iterations=ITERATIONS, check=False)
-    alphas = tuple(c.alpha for c in found.candidates)
-    utilities = tuple(found.standing.utilities)
-    return FlightRun(seed, False, utilities, len(found.trials), alphas)
+    row |= {"utilities": list(found.standing.utilities), "trials": len(found.trials)}
+    return row | {"alphas": [one.alpha for one in found.candidates]}
+
+
+def _table_1(rows: list[Row], optimum: float) -> Study:
+    """Return the document, a row per run and means, and the table beside the paper's."""
+    flown = [row for row in rows if not row["discarded"]]
+    first, last = ([row["utilities"][k] for row in flown] for k in (0, -1))
+    gains = [improvement(*ends) for ends in zip(first, last, strict=True)]
+    ratio = improvement(float(np.mean(first)), float(np.mean(last)))
+    each = float(np.mean([(r["trials"] - 1) / max(len(r["utilities"]) - 1, 1) for r in flown]))
+    gap = max((optimum - u) / -optimum for u in last)
+    mean, se = mean_se(gains)
+    found = document(
+        runs=[row | {"optimum": optimum} for row in rows],
+        model_based=mean_se(first),
+        learned=mean_se(last),
+        optimum=optimum,
+        worst_gap_to_optimum=gap,
+        improvement={"mean": mean, "se": se, "ratio_of_means": ratio},
+        trials=float(np.mean([row["trials"] for row in flown])),
+        trials_an_iteration=each,
+        discarded=len(rows) - len(flown),
+        paper=PAPER,
+    )
+    lines = (
+        ("utility, model-based", mean_text(first, ",.0f"), "-13,028 (±330)"),
+        (f"utility, up to {ITERATIONS} iterations", mean_text(last, ",.0f"), "-3,000 (±100)"),
+        ("improvement, mean of ratios", mean_text(gains), "76 % (±2 %)"),
+        ("improvement, ratio of means", f"{ratio:.1%}", ""),
+        ("optimum with the true parameters", f"{optimum:,.0f}", "not given"),
+        ("largest distance to it", f"{gap:.2%}", "not given"),
+        ("trials an iteration", f"{each:.2f}", "typically 1"),
+        ("discarded", f"{len(rows) - len(flown)} of {len(rows)}", "about 20 %"),
+    )
+    runs = f"{len(flown)} runs, mean (± one standard error)" if len(flown) > 1 else "one run"
+    title = f"Table 1: flight simulator, {runs}"
+    return Study(found, (StudyTable(title, ("", "here", "paper"), lines),))
 
 
 def real_flight(truth: Task, candidate: Candidate) -> Trial:

@@ -71,6 +71,22 @@ class StudyTable:
     rows: tuple[tuple[str, ...], ...]
 
 
+@dataclass(frozen=True)
+class Study:
+    """What a study found."""
+
+    document: dict[str, Any]  # of `grounded experiment NAME --json`
+    shown: tuple[StudyTable, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the document."""
+        return self.document
+
+    def tables(self) -> tuple[StudyTable, ...]:
+        """Return its figures beside the paper's."""
+        return self.shown
+
+
 def improvement(before: float, after: float) -> float:
     """Return the share of the cost that is gone."""
     return (after - before) / abs(before)

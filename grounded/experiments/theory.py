@@ -33,7 +33,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -41,7 +40,7 @@ from scipy.optimize import minimize_scalar
 
 from grounded.compile import Problem
 from grounded.engine import Engine
-from grounded.experiments.jobs import Progress, StudyTable, mean_se, mean_text, run_jobs
+from grounded.experiments.jobs import Progress, Study, StudyTable, mean_se, mean_text, run_jobs
 from grounded.frozen import Array
 from grounded.model import Model, Param
 from grounded.result import document
@@ -60,91 +59,53 @@ ITERATIONS = 3000
 CLOSE = 1e-8  # relative tolerance of a line search
 
 
-@dataclass(frozen=True)
-class Theorem1Row:
-    """One search: gradient error at its start, squared gradient at its end, largest K."""
-
-    epsilon: float
-    seed: int
-    error: float  # |grad U - grad U^| at the first policy
-    squared: float  # |grad U|^2 where the line search ended
-    K: float
-    iterations: int
-
-    @property
-    def ratio(self) -> float:
-        """|grad U|^2 over the bound 2 K^2 epsilon^2."""
-        return self.squared / (2 * (self.K * self.epsilon) ** 2)
-
-
-@dataclass(frozen=True)
-class Theorem1Result:
-    """All searches."""
-
-    rows: tuple[Theorem1Row, ...]
-
-    def slopes(self) -> dict[str, list[float]]:
-        """Return slopes of log gradient error and log squared gradient over log epsilon.
-
-        One slope per seed, because K depends on the shape of the model's error.
-        """
-        found: dict[str, list[float]] = {"gradient_error": [], "squared_gradient": []}
-        for own in self._by("seed").values():
-            x, error, squared = np.log([(row.epsilon, row.error, row.squared) for row in own]).T
-            for each, y in zip(found.values(), (error, squared), strict=True):
-                each.append(float(np.polyfit(x, y, 1)[0]))
-        return found
-
-    def _by(self, name: str) -> dict[float, list[Theorem1Row]]:
-        found: dict[float, list[Theorem1Row]] = {}
-        for row in self.rows:
-            found.setdefault(getattr(row, name), []).append(row)
-        return found
-
-    def to_json(self) -> dict[str, Any]:
-        """Return rows and slopes as plain values."""
-        slopes = {name: mean_se(values) for name, values in self.slopes().items()}
-        return document(
-            rows=[vars(row) for row in self.rows],
-            slopes={name: {"slope": mean, "se": se} for name, (mean, se) in slopes.items()},
-            largest_ratio_to_bound=max(row.ratio for row in self.rows),
-            paper={"gradient_error": 1, "squared_gradient": 2},
-            K=max(row.K for row in self.rows),
-        )
-
-    def tables(self) -> list[StudyTable]:
-        """Return medians by epsilon, and the slopes beside the theorem's."""
-        rows = tuple(
-            (
-                f"{epsilon:g}",
-                f"{np.median([row.error for row in own]):.3g}",
-                f"{np.median([row.squared for row in own]):.3g}",
-                f"{max(row.ratio for row in own):.3f}",
-            )
-            for epsilon, own in self._by("epsilon").items()
-        )
-        share = "share of 2 K^2 epsilon^2, at most"
-        head = ("epsilon", "|grad U - grad U^|", "|grad U|^2 at the end", share)
-        slopes = tuple(
-            (f"{name.replace('_', ' ')} over epsilon", mean_text(values, ".3f"), bound)
-            for (name, values), bound in zip(self.slopes().items(), "12", strict=True)
-        )
-        return [
-            StudyTable("Theorem 1: medians of the seeds", head, rows),
-            StudyTable("Slopes (± one standard error)", ("", "here", "of the bound"), slopes),
-        ]
-
-
 def theorem1(
     seeds: Sequence[int] = range(8),
     *,
     epsilons: Sequence[float] = EPSILONS,
     engine: Engine | None = None,
     progress: Progress | None = None,
-) -> Theorem1Result:
+) -> Study:
     """Run a search for each epsilon and seed; the seed sets the shape of the model's error."""
     cases = [{"epsilon": float(epsilon), "seed": seed} for epsilon in epsilons for seed in seeds]
-    return Theorem1Result(tuple(run_jobs(theorem1_job, cases, engine, progress)))
+    rows = run_jobs(theorem1_job, cases, engine, progress)
+    # one slope per seed of the logarithms over log epsilon: K depends on the shape of the error
+    slopes: dict[str, list[float]] = {"gradient_error": [], "squared_gradient": []}
+    for seed in seeds:
+        own = [
+            (row["epsilon"], row["error"], row["squared"]) for row in rows if row["seed"] == seed
+        ]
+        x, *each = np.log(own).T
+        for found, y in zip(slopes.values(), each, strict=True):
+            found.append(float(np.polyfit(x, y, 1)[0]))
+    # |grad U|^2 over the bound 2 K^2 epsilon^2
+    ratio = [row["squared"] / (2 * (row["K"] * row["epsilon"]) ** 2) for row in rows]
+    lines = []
+    for epsilon in epsilons:
+        some = [i for i, row in enumerate(rows) if row["epsilon"] == epsilon]
+        medians = (np.median([rows[i][name] for i in some]) for name in ("error", "squared"))
+        largest = f"{max(ratio[i] for i in some):.3f}"
+        lines.append((f"{epsilon:g}", *(f"{value:.3g}" for value in medians), largest))
+    share = "share of 2 K^2 epsilon^2, at most"
+    head = ("epsilon", "|grad U - grad U^|", "|grad U|^2 at the end", share)
+    bounds = tuple(
+        (f"{name.replace('_', ' ')} over epsilon", mean_text(values, ".3f"), bound)
+        for (name, values), bound in zip(slopes.items(), "12", strict=True)
+    )
+    means = {name: mean_se(values) for name, values in slopes.items()}
+    return Study(
+        document(
+            rows=rows,
+            slopes={name: {"slope": mean, "se": se} for name, (mean, se) in means.items()},
+            largest_ratio_to_bound=max(ratio),
+            paper={"gradient_error": 1, "squared_gradient": 2},
+            K=max(row["K"] for row in rows),
+        ),
+        (
+            StudyTable("Theorem 1: medians of the seeds", head, tuple(lines)),
+            StudyTable("Slopes (± one standard error)", ("", "here", "of the bound"), bounds),
+        ),
+    )
 
 
 def _dynamics(s: Any, a: Any, p: Any) -> dict[str, Any]:
@@ -183,8 +144,11 @@ def theorem1_task(epsilon: float, seed: int) -> Task:
     )
 
 
-def theorem1_job(epsilon: float, seed: int) -> Theorem1Row:
-    """Run one job: one search to its end."""
+def theorem1_job(epsilon: float, seed: int) -> dict[str, Any]:
+    """Run one job: one search to its end.
+
+    `error`: |grad U - grad U^| at the first policy. `squared`: |grad U|^2 at the end. `K`: largest.
+    """
     task = theorem1_task(epsilon, seed)
     truth = task.with_model(task.model.with_values({"eps": 0.0}))
     real = truth.problem(exact=True)
@@ -199,8 +163,8 @@ def theorem1_job(epsilon: float, seed: int) -> Theorem1Row:
         first, K = first or error, max(K, error / epsilon)
         better = _line_search(real, u, -guess, float(swarm.cost[0]))
         if better is None or iterations >= ITERATIONS:
-            squared = float((own**2).sum())
-            return Theorem1Row(epsilon, seed, first, squared, K, iterations)
+            row = {"epsilon": epsilon, "seed": seed, "error": first}
+            return row | {"squared": float((own**2).sum()), "K": K, "iterations": iterations}
         u, iterations = better, iterations + 1
 
 
@@ -224,42 +188,22 @@ def _line_search(real: Problem, u: Array, direction: Array, cost: float) -> Arra
 OFFSETS = (1.0, 2.0, 3.0, 5.0, 10.0, 30.0)
 
 
-@dataclass(frozen=True)
-class Footnote9Row:
-    """Results for one b; utilities as a share of the optimum C."""
+def footnote9(offsets: Sequence[float] = OFFSETS) -> Study:
+    """Compare the model's policy and one iteration of the algorithm for each b in `offsets`.
 
-    b: float
-    model_based: float
-    solved: float  # after one iteration
-    solved_trials: int
-
-
-@dataclass(frozen=True)
-class Footnote9Result:
-    """Results for all b."""
-
-    rows: tuple[Footnote9Row, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the rows as plain values."""
-        return {"rows": [vars(row) for row in self.rows], "paper": {"iterations": 1}}
-
-    def tables(self) -> list[StudyTable]:
-        """Return the shares of the optimum by b."""
-        head = ("b", "model-based", "one iteration (trials)")
-        rows = tuple(
-            (f"{r.b:g}", f"{r.model_based:.3g}", f"{r.solved:.6f} ({r.solved_trials})")
-            for r in self.rows
-        )
-        return [StudyTable("Footnote 9: utility as a share of the optimum", head, rows)]
+    Utilities are shares of the optimum C.
+    """
+    rows = [_row(b) for b in offsets]
+    head = ("b", "model-based", "one iteration (trials)")
+    lines = tuple(
+        (f"{r['b']:g}", f"{r['model_based']:.3g}", f"{r['solved']:.6f} ({r['solved_trials']})")
+        for r in rows
+    )
+    table = StudyTable("Footnote 9: utility as a share of the optimum", head, lines)
+    return Study({"rows": rows, "paper": {"iterations": 1}}, (table,))
 
 
-def footnote9(offsets: Sequence[float] = OFFSETS) -> Footnote9Result:
-    """Compare the model's policy and one iteration of the algorithm for each b in `offsets`."""
-    return Footnote9Result(tuple(map(_row, offsets)))
-
-
-def _row(b: float) -> Footnote9Row:
+def _row(b: float) -> dict[str, Any]:
     zero, one = np.zeros(1), np.ones(1)
     model = Model(
         name="footnote 9",
@@ -286,4 +230,5 @@ def _row(b: float) -> Footnote9Row:
 
     found = learn(task, real, SearchOptions(step="full"), max_iterations=1, check=False)
     share = math.exp(found.standing.utilities[-1])
-    return Footnote9Row(b, math.exp(-(b**2)), share, len(found.trials))
+    row = {"b": b, "model_based": math.exp(-(b**2)), "solved": share}
+    return row | {"solved_trials": len(found.trials)}
