@@ -212,9 +212,9 @@ def export_candidate(
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
-    waiting = handed.check.standing.outstanding
+    now = handed.standing
+    waiting = now.outstanding
     how = () if waiting and waiting.id == identity else ("--candidate", identity)
-    now = handed.check.standing
     with suppress(GroundedError):  # another candidate's file is damaged
         now = known_end(workspace, workspace.read(), now) or now
     best = now.incumbent is not None and now.incumbent.candidate.id == identity

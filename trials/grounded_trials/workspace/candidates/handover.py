@@ -18,7 +18,6 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -32,7 +31,7 @@ from grounded.search.difference import in_question
 from grounded.search.safety import coasts_out, objections, spread
 from grounded.search.standing import Standing
 from grounded.task import Task
-from grounded.trial import Trial, mean_trial
+from grounded.trial import mean_trial
 from grounded_trials.wording import what_became
 from grounded_trials.workspace.candidates.search_state import standing_of
 from grounded_trials.workspace.folder import Folder
@@ -53,13 +52,9 @@ class Handed:
     candidate: Candidate
     meta: dict[str, str]
     data: bytes
-    check: Check
-    overridden: tuple[Finding, ...] = ()  # reasons to refuse it, overridden by `anyway`
-
-    @property
-    def findings(self) -> tuple[Finding, ...]:
-        """What is told of the candidate, the heaviest first."""
-        return settle(one for one in self.check.notes() if one)
+    standing: Standing  # of the search
+    findings: tuple[Finding, ...]  # what is told of it, the heaviest first
+    overridden: tuple[Finding, ...]  # reasons to refuse it, overridden by `anyway`
 
 
 class Void(GroundedError):
@@ -92,22 +87,28 @@ def checked_candidate(
         anyway: hand it over despite reasons against it, which are then in `overridden`.
         other_task: accept a candidate of another task if a trial ran it.
         now: the standing of the search, if known.
+
+    Raises:
+        Void: if it must not be handed over, unless `anyway`. Another GroundedError refuses a file
+            that is damaged, rewritten, renamed or for another robot, and checks [log].
     """
     data = workspace.candidate_bytes(identity)
     candidate, meta = candidate_of(data, identity)
-    check = Check(workspace, candidate, meta, other_task, now)
-    check.refuse_foreign(sha256(data))
+    refuse_foreign(workspace, candidate, sha256(data))
     if not anyway:
         check_log(workspace)
-    reasons = tuple(check.reasons())
+    check = Check(workspace, candidate, meta, now)
+    reasons = tuple(check.reasons(other_task))
     if reasons and not anyway:
         raise Void(identity, reasons)
+    told = settle(one for one in check.notes() if one)
     if (lost := unmapped(workspace)) is not None:
         reasons = (lost, *reasons)
     stored = workspace.store.list()
     after = stored[-1].path.stem if stored else ""
     workspace.note(note="hand-out", candidate=identity, sha256=sha256(data), after=after)
-    return Handed(candidate, meta, data, check, tuple(one.weighing(Weight.WARN) for one in reasons))
+    overridden = tuple(one.weighing(Weight.WARN) for one in reasons)
+    return Handed(candidate, meta, data, check.standing, told, overridden)
 
 
 def unmapped(workspace: Folder) -> Finding | None:
@@ -133,50 +134,41 @@ def check_log(workspace: Folder) -> None:
             raise GroundedError(one)
 
 
-@dataclass(frozen=True)
+def refuse_foreign(workspace: Folder, made: Candidate, digest: str) -> None:
+    """Refuse a candidate for another robot, or one not equal to what was handed out or run."""
+    model, then, file = workspace.base_model, PROPOSE, f"candidates/{made.id}.mcap"
+    for names, own in (
+        (made.policy.state_names, model.state_names),
+        (made.policy.input_names, model.input_names),
+    ):
+        if names != own:
+            raise refused("given.fit", made.id, then=then, what="signals", theirs=names, own=own)
+    if digest not in workspace.noted.handed.get(made.id, {digest}):
+        raise refused("file.changed", file, then=then, what="candidate")
+    for one in workspace.whole_trials():
+        if one.trial.candidate == made.id and one.ran not in ("", digest):
+            raise refused("file.changed", file, then=then, what="policy", lost=one.stored.id)
+
+
 class Check:
     """A candidate checked against the current workspace; damaged trial files are ignored."""
 
-    workspace: Folder
-    candidate: Candidate
-    meta: dict[str, str]
-    other_task: bool
-    now: Standing | None
+    def __init__(
+        self, workspace: Folder, made: Candidate, meta: dict[str, str], now: Standing | None
+    ) -> None:
+        self.workspace, self.made, self.meta = workspace, made, meta
+        self.standing = now or standing_of(workspace, workspace.read(strict=False))
+        self.same_task = meta.get("task") == workspace.task.hash
+        self.changed = made.model != workspace.planner.fingerprint  # the model was, since
+        ran = (one.trial for one in workspace.whole_trials() if one.trial.candidate == made.id)
+        self.ran = [*ran]  # also runs that no longer fit the task
+        self.runs = [trial for trial in self.ran if workspace.fits(trial)]
 
-    @cached_property
-    def standing(self) -> Standing:
-        """The standing of the search."""
-        return self.now or standing_of(self.workspace, self.workspace.read(strict=False))
-
-    @property
-    def same_task(self) -> bool:
-        """Whether the candidate was made for the current task."""
-        return self.meta.get("task") == self.workspace.task.hash
-
-    def refuse_foreign(self, found_hash: str) -> None:
-        """Refuse a candidate for another robot, or one not equal to what was handed out or run."""
-        made, model = self.candidate, self.workspace.base_model
-        for names, own in (
-            (made.policy.state_names, model.state_names),
-            (made.policy.input_names, model.input_names),
-        ):
-            if names != own:
-                raise refused(
-                    "given.fit", made.id, then=PROPOSE, what="signals", theirs=names, own=own
-                )
-        file, then = f"candidates/{made.id}.mcap", PROPOSE
-        if found_hash not in self.workspace.noted.handed.get(made.id, {found_hash}):
-            raise GroundedError(found("file.changed", file, then=then, what="candidate"))
-        for one in self.workspace.whole_trials():
-            if one.trial.candidate == made.id and one.ran not in ("", found_hash):
-                ran = one.stored.id
-                raise GroundedError(found("file.changed", file, then=then, what="policy", lost=ran))
-
-    def reasons(self) -> Iterator[Finding]:
+    def reasons(self, accepts_other: bool) -> Iterator[Finding]:
         """Yield the reasons why it must not be handed over."""
-        made, config, name = self.candidate, self.workspace.config, self.candidate.id
-        if abs(made.policy.dt - config.task.dt) > 1e-9:
-            own, now = Quantity(made.policy.dt, "s"), Quantity(config.task.dt, "s")
+        made, name, task = self.made, self.made.id, self.workspace.task
+        if abs(made.policy.dt - task.dt) > 1e-9:
+            own, now = Quantity(made.policy.dt, "s"), Quantity(task.dt, "s")
             yield found("given.fit", name, what="dt", theirs=own, own=now)
         model = self.workspace.base_model
         for kind, own_units in (("states", model.states), ("inputs", model.inputs)):
@@ -184,28 +176,36 @@ class Check:
                 if unit != own_units[signal]:
                     wanted = own_units[signal]
                     yield found("given.fit", signal, what="unit", theirs=unit, own=wanted)
-        yield from outside_limits(self.workspace.task, made.policy)
-        if not self.same_task and not (self.other_task and self._ran):
-            yield found(
-                "plan.other_task",
-                name,
-                what=other_task(self.workspace.task, made),
-                never=int(self.other_task),
-            )
-        elif self.void:
+        yield from outside_limits(task, made.policy)
+
+        # A step of the search for another task, or planned with another model, that no trial ran.
+        searched = self.meta.get("kind") == "search"
+        if not self.same_task and not (accepts_other and self.ran):
+            never, what = int(accepts_other), other_task(task, made)
+            yield found("plan.other_task", name, what=what, never=never)
+        elif searched and self.same_task and self.changed and not self.runs:
             yield found("plan.outdated", name, weight=Weight.REFUSE, candidate=name)
         yield from self._unsafe()
 
     def notes(self) -> Iterator[Finding | None]:
         """Yield what the user should know although it does not prevent its use."""
-        made, name, best = self.candidate, self.candidate.id, self.standing.incumbent
-        if best is not None and not self._runs:
-            yield in_question(made, best, self.workspace.config.search.repeats)
-        yield from self._became()
+        made, name, now = self.made, self.made.id, self.standing
+        if now.incumbent is not None and not self.runs:
+            yield in_question(made, now.incumbent, self.workspace.config.search.repeats)
+
+        # Its trials, or those that it was made from, were set aside.
+        aside = self.workspace.discarded()
+        tried = next((t for t in now.history if t.candidate.id == name), None)
+        if tried is not None and tried.void:
+            yield disowned(tried, aside)
+        for one in self.workspace.aside_trials():
+            if one.trial.candidate == name:
+                told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
+                yield told.also(why=aside[one.stored.id])
         if not self.same_task:
             yield found("plan.other_task", name, weight=Weight.NOTE)
             return
-        if self._changed:
+        if self.changed:
             yield found("plan.outdated", name, candidate=name)
 
         # Where the robot goes after the run, with the input held then.
@@ -213,48 +213,16 @@ class Check:
         held = np.clip(policy.past, policy.low, policy.high)
         yield coasts_out(planner.task, planner.plan, planner.lift(made.predicted_run), held)
 
-    def _became(self) -> Iterator[Finding]:
-        """Yield that its trials were set aside, or those that it was made from."""
-        name = self.candidate.id
-        tried = next((t for t in self.standing.history if t.candidate.id == name), None)
-        aside = self.workspace.discarded()
-        if tried is not None and tried.void:
-            yield disowned(tried, aside)
-        for one in self.workspace.aside_trials():
-            if one.trial.candidate == name:
-                told = found("search.aside", one.stored.id, candidate=name, weight=Weight.NOTE)
-                yield told.also(why=aside[one.stored.id])
-
-    @property
-    def void(self) -> bool:
-        """Whether it is a step of the search, planned with another model, that no trial ran."""
-        searched = self.meta.get("kind") == "search" and self.same_task
-        return searched and not self._runs and self._changed
-
-    @property
-    def _changed(self) -> bool:
-        return self.candidate.model != self.workspace.planner.fingerprint
-
-    @cached_property
-    def _ran(self) -> list[Trial]:
-        """Its runs, also those that no longer fit the task, whose files are intact."""
-        every = (one.trial for one in self.workspace.whole_trials())
-        return [trial for trial in every if trial.candidate == self.candidate.id]
-
-    @property
-    def _runs(self) -> list[Trial]:
-        return [trial for trial in self._ran if self.workspace.fits(trial)]
-
     def _unsafe(self) -> tuple[Finding, ...]:
         """Return objections of [safety]; a step not run yet gets a margin for how runs strayed.
 
         If the model was changed since it ran, its runs count instead of the prediction.
         """
-        made, task, strays = self.candidate, self.workspace.task, None
+        made, task, strays = self.made, self.workspace.task, None
         same = made.policy.horizon == task.horizon and abs(made.policy.dt - task.dt) <= 1e-9
-        runs = [one.until(task.horizon) for one in self._runs]
+        runs = [one.until(task.horizon) for one in self.runs]
         whole = [one for one in runs if one.finite_steps == task.horizon]
-        if self._changed and same and whole:
+        if self.changed and same and whole:
             mean = mean_trial(whole, task.model.angle_mask)
             made = replace(made, predicted_states=mean.states)
         if same and not runs:
