@@ -26,7 +26,7 @@ from grounded.checks import one_of, refused
 from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.policy import Policy, to_arrays
-from grounded.result import UNSAID, Document
+from grounded.result import UNSAID, Document, plain
 from grounded.search.standing import Ending
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.candidates.handover import checked_candidate
@@ -60,25 +60,13 @@ def _npz(policy: Policy, said: dict[str, Any]) -> bytes:
 
 
 def _json(policy: Policy, said: dict[str, Any]) -> bytes:
-    low, high = (
-        [v if np.isfinite(v) else None for v in end.tolist()] for end in (policy.low, policy.high)
-    )
-    document: dict[str, Any] = {
-        "format": onboard.FORMAT,
-        **said,
-        "dt": policy.dt,
-        "state_names": policy.state_names,
-        "input_names": policy.input_names,
-        "z_names": policy.z_names,
-        "angles": _angles(policy),
-        "low": low,
-        "high": high,
-        "past": policy.past.tolist(),
-        "feedforward": policy.feedforward.tolist(),
-    }
-    if policy.gain is not None and policy.reference is not None:
-        document |= {"gain": policy.gain.tolist(), "reference": policy.reference.tolist()}
-    return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
+    """Format a table; limits that there are not are null."""
+    table = {"format": onboard.FORMAT, **said}
+    table |= {k: getattr(policy, k) for k in ("dt", "state_names", "input_names", "z_names")}
+    table |= {"angles": _angles(policy)}
+    for key in ("low", "high", "past", "feedforward", "gain", "reference"):
+        table |= {} if getattr(policy, key) is None else {key: getattr(policy, key)}
+    return (json.dumps(plain(table), indent=1, allow_nan=False) + "\n").encode()
 
 
 def _angles(policy: Policy) -> list[str]:
@@ -193,10 +181,9 @@ def export_candidate(
     Without `form` the ending of `path` decides the format; without one it is npz with `runner`,
     else json.
     """
-    known = dict(zip(FORMS, (_csv, _json, _npz), strict=True))
-    form = form or format_of(path, tuple(known), "npz" if runner else "json")
+    form = form or format_of(path, FORMS, "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
-    among("format", [form], known)
+    among("format", [form], FORMS)
     if runner:
         one_of("format of the runner", form, ["npz"])
     now = standing_in(workspace) if identity == "best" else None
@@ -207,27 +194,26 @@ def export_candidate(
             onboard.check_limits(identity, handed.candidate.policy)
         except ValueError as error:
             raise refused("plan.refused", identity, why=str(error)) from None
-    policy = handed.candidate.policy
-    write_atomically(path, known[form](policy, _said(workspace, policy, identity, handed.meta)))
+    policy, written = handed.candidate.policy, {"csv": _csv, "json": _json, "npz": _npz}[form]
+    write_atomically(path, written(policy, _said(workspace, policy, identity, handed.meta)))
     program = path.with_name(RUNNER) if runner else None
     if program is not None:
         write_atomically(program, Path(onboard.__file__).read_bytes())
     now = handed.standing
-    waiting = now.outstanding
-    how = () if waiting and waiting.id == identity else ("--candidate", identity)
+    waits = now.outstanding is not None and now.outstanding.id == identity
     with suppress(GroundedError):  # another candidate's file is damaged
         now = known_end(workspace, workspace.read(), now) or now
     best = now.incumbent is not None and now.incumbent.candidate.id == identity
     ended = best and now.ending is not Ending.NONE
     told = (*handed.overridden, *handed.findings)
-    return Exported(identity, path, form, program, told, ended, how)
+    return Exported(
+        identity, path, form, program, told, ended, () if waits else ("--candidate", identity)
+    )
 
 
-def format_of(path: Path | None, formats: Sequence[str], default: str) -> str:
-    """Return the format that a file's ending names; `default` without an ending."""
+def form_of(form: str | None, path: Path | None, formats: Sequence[str], default: str) -> str:
+    """Return the format that was asked for, or that a file's ending names; else the default."""
     ending = path.suffix.lstrip(".").lower() if path else ""
-    if ending in formats:
-        return ending
-    if ending:
-        one_of(f"the ending of {path}", ending, formats)
-    return default
+    if form or ending:
+        one_of("the format" if form else f"the ending of {path}", form or ending, formats)
+    return form or ending or default
