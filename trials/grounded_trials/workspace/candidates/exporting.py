@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 
 from grounded import onboard
-from grounded.checks import known as among
 from grounded.checks import one_of, refused
 from grounded.errors import GroundedError
 from grounded.findings import Finding
@@ -149,8 +148,7 @@ def _export_trial(
     workspace: Folder, identity: str, form: str | None, path: Path | None
 ) -> Exported:
     """Write a trial as a table with a row for each state."""
-    form = form or format_of(path, RUNS, "csv")
-    one_of("the format of a run", form, RUNS)
+    form = form_of(form, path, RUNS, "csv")
     path = path or Path(f"{identity}.{form}")
     trial = next((one.trial for one in workspace.trials() if one.trial.id == identity), None)
     if trial is None:
@@ -181,9 +179,8 @@ def export_candidate(
     Without `form` the ending of `path` decides the format; without one it is npz with `runner`,
     else json.
     """
-    form = form or format_of(path, FORMS, "npz" if runner else "json")
+    form = form_of(form, path, FORMS, "npz" if runner else "json")
     path = path or Path(f"{identity}.{form}")
-    among("format", [form], FORMS)
     if runner:
         one_of("format of the runner", form, ["npz"])
     now = standing_in(workspace) if identity == "best" else None
@@ -206,9 +203,8 @@ def export_candidate(
     best = now.incumbent is not None and now.incumbent.candidate.id == identity
     ended = best and now.ending is not Ending.NONE
     told = (*handed.overridden, *handed.findings)
-    return Exported(
-        identity, path, form, program, told, ended, () if waits else ("--candidate", identity)
-    )
+    named = () if waits else ("--candidate", identity)
+    return Exported(identity, path, form, program, told, ended, named)
 
 
 def form_of(form: str | None, path: Path | None, formats: Sequence[str], default: str) -> str:
