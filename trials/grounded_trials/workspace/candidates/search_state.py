@@ -115,33 +115,20 @@ def planned(
     made = propose(
         task, contents.candidates, trials, options, identity=name, planner=planner, tick=tick
     )
-    if planning and made.candidate is None:
-        remember_end(workspace, contents, made.standing)
+    end = made.standing.ending
+    if planning and made.candidate is None and end not in (Ending.NONE, *UNSAID):
+        findings = [one.to_json() for one in made.standing.findings]
+        known_by = {"of": _digest(workspace, contents), "ending": end, "findings": findings}
+        store(_place(workspace), json.dumps(known_by).encode(), KIND)
     return made
 
 
 def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing | None:
     """Return the end of a search that was planned before; None if it goes on or is not known."""
-    from grounded.compile.run.jit import stored
-
-    kept = stored(_place(workspace), KIND)
-    if kept is None:
+    kept = json.loads(stored(_place(workspace), KIND) or b"{}")
+    if not kept or kept["of"] != _digest(workspace, contents):
         return None
-    said = json.loads(kept)
-    if said["of"] != _digest(workspace, contents):
-        return None
-    return ended(now, Ending(said["ending"]), *map(Finding.from_json, said["findings"]))
-
-
-def remember_end(workspace: Folder, contents: Contents, now: Standing) -> None:
-    """Keep the end of a search, unless it goes on or a candidate was refused, with its reasons."""
-    if now.ending is Ending.NONE or now.ending in UNSAID:
-        return
-    from grounded.compile.run.jit import store
-
-    findings = [one.to_json() for one in now.findings]
-    document = {"of": _digest(workspace, contents), "ending": now.ending, "findings": findings}
-    store(_place(workspace), json.dumps(document).encode(), KIND)
+    return ended(now, Ending(kept["ending"]), *map(Finding.from_json, kept["findings"]))
 
 
 def _place(workspace: Folder) -> str:
@@ -153,20 +140,15 @@ def _digest(workspace: Folder, contents: Contents) -> str:
 
     A stored trial's name has a hash of its contents.
     """
+    planner, config = workspace.planner, workspace.config
     trials = [(one.stored.path.name, one.trial.candidate) for one in contents.trials]
-    models = [model_fingerprint(task) for task in (workspace.planner.task, workspace.planner.plan)]
+    models = [model_fingerprint(task) for task in (planner.task, planner.plan)]
     digest = hashlib.sha256(repr((_version(), workspace.task.hash, models, trials)).encode())
-    files = [workspace.config.file, *_model_file(workspace)]
-    files += [workspace.candidate_path(one.id) for one in contents.candidates]
-    for path in files:
+    files = [workspace.candidate_path(one.id) for one in contents.candidates]
+    for path in (config.file, workspace.folder / (config.model.file or config.file.name), *files):
         data = path.read_bytes() if path.is_file() else b""
         digest.update(repr((path.name, len(data))).encode() + data)
     return digest.hexdigest()
-
-
-def _model_file(workspace: Folder) -> list[Path]:
-    file = workspace.config.model.file
-    return [workspace.folder / file] if file else []
 
 
 @cache
