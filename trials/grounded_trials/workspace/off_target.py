@@ -21,7 +21,6 @@ from grounded.model import Model
 from grounded.result import Document, or_zero
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.workspace.user_files.task_file import equal_weights
 
 # groups of states reported beside the one that costs most: positions and angles before their
 # rates, then by cost
@@ -30,6 +29,13 @@ EXACT = 1e-4  # share of the largest error below which a plan's end is on target
 RATES = ("speed", "heading_rate", "rates")  # roles of velocities
 # of the highest speed: below it a path's radius is not computed from its samples
 SPEED_OF_RADIUS = 0.5
+SMALLEST_RANGE = 0.1  # smallest range of a target column used for its weight
+# a column counts as constant if its range is below STILL_SHARE of its size (of SMALLEST_RANGE if
+# that is less), or below HARDLY in its unit
+STILL_SHARE, HARDLY = 0.01, 1e-4
+RATE = 0.1  # weight of a velocity beside its position, relative to that of other states
+NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
+UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
@@ -160,9 +166,36 @@ def rates_beside(model: Model, names: Collection[str]) -> set[str]:
 
 
 def usual_weights(model: Model, columns: Mapping[str, Array]) -> dict[str, float]:
-    """Return the weights on the states of a target that nobody chose, see `equal_weights`."""
-    rates = rates_beside(model, columns)
-    return equal_weights(columns, model.states, position_names(model), rates)
+    """Return the weights on a target's states that nobody chose: an error of its range costs 1.
+
+    That of a velocity beside its position costs RATE: its noise is a larger part of its range, and
+    a plan would leave the path for the sake of the speed. The axes of a position share the smallest
+    range, of at least NARROW of the largest. A constant column gets the largest range or size among
+    the columns of its unit (a y that is constant while x moves; a step to a constant 5 m), or
+    UNKNOWN if none of them moves or is larger than UNKNOWN.
+    """
+    rates, position = rates_beside(model, columns), position_names(model)
+    ranges = {name: _range_of(values) for name, values in columns.items()}
+    if axes := [own for name, own in ranges.items() if name in position and own > 0]:
+        narrow = max(min(axes), NARROW * max(axes))
+        ranges |= {name: narrow for name in ranges if name in position}
+    size, told = dict[str, float](), set[str]()  # by unit, and whether it tells a small error
+    for name, own in ranges.items():
+        unit, most = model.states[name], float(np.abs(columns[name]).max())
+        size[unit] = max(size.get(unit, 0.0), own or most)
+        told |= {unit} if own or most > UNKNOWN else set()
+    weights = dict[str, float]()
+    for name, own in ranges.items():
+        unit = model.states[name]
+        width = own or (size[unit] if unit in told else UNKNOWN)
+        weights[name] = (RATE if name in rates else 1.0) * max(width, SMALLEST_RANGE) ** -2
+    return weights
+
+
+def _range_of(values: Array) -> float:
+    """Return the range of a target column, 0 if it hardly moves (from 0.02591 to 0.0259 rad)."""
+    own, size = float(np.ptp(values)), min(float(np.abs(values).max()), SMALLEST_RANGE)
+    return own if own > max(STILL_SHARE * size, HARDLY) else 0.0
 
 
 def driven(model: Model, columns: Mapping[str, Array], dt: float) -> tuple[float, float]:

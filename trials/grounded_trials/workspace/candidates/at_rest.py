@@ -23,9 +23,8 @@ from grounded.search.noise import sensor_noise
 from grounded.task import Task
 from grounded.trial import Trial
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.off_target import usual_weights
+from grounded_trials.workspace.off_target import SMALLEST_RANGE, usual_weights
 from grounded_trials.workspace.user_files.config import OFFERED
-from grounded_trials.workspace.user_files.task_file import SMALLEST_RANGE
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -111,19 +111,15 @@ def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:
     """Call the user's command; its stdout goes to stderr."""
     check_own(workspace.folder, [workspace.folder / FILE])
     file = workspace.bring_back(handed.candidate.id)
-    words = {
-        "candidate": str(file.resolve()),
-        "trial": str(path.resolve()),
-    }
-    for name in words:
-        if "{" + name + "}" not in command:
-            raise wrong("[system] command", command, must="words", like=EXAMPLE)
+    words = {"{candidate}": str(file.resolve()), "{trial}": str(path.resolve())}
+    if not all(word in command for word in words):
+        raise wrong("[system] command", command, must="words", like=EXAMPLE)
     try:
         parts = shlex.split(command)
     except ValueError as error:
         raise wrong("[system] command", got=f"{command} ({error})", must="words") from None
-    for name, text in words.items():
-        parts = [part.replace("{" + name + "}", text) for part in parts]
+    for word, text in words.items():
+        parts = [part.replace(word, text) for part in parts]
     try:
         done = subprocess.run(parts, cwd=workspace.folder, stdout=2, check=False)
     except OSError as error:

@@ -103,6 +103,7 @@ def planned(
     workspace: Folder, contents: Contents, tick: Callable[[str], None] | None = None
 ) -> Proposal:
     """Ask the search for a proposal, unless it is known to have ended with these contents."""
+    from grounded.compile.run.jit import store
     from grounded.search.improve import propose
 
     task, options, planner = workspace.task, workspace.config.search, workspace.planner
@@ -125,6 +126,8 @@ def planned(
 
 def known_end(workspace: Folder, contents: Contents, now: Standing) -> Standing | None:
     """Return the end of a search that was planned before; None if it goes on or is not known."""
+    from grounded.compile.run.jit import stored
+
     kept = json.loads(stored(_place(workspace), KIND) or b"{}")
     if not kept or kept["of"] != _digest(workspace, contents):
         return None

@@ -10,6 +10,7 @@ import importlib
 import importlib.util
 import sys
 import traceback
+from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -49,12 +50,8 @@ def load_module(
     sys.modules[spec.name] = found  # dataclasses look their module up there
     try:
         # a model's prints must not mix with our output; files it reads are relative to its folder
-        with contextlib.redirect_stdout(sys.stderr), beside(path.parent), contained():
+        with contextlib.redirect_stdout(sys.stderr), beside(path.parent), _running(str(path)):
             spec.loader.exec_module(found)
-    except GroundedError as error:
-        raise error.at(str(path)) from None
-    except Exception as error:
-        raise _failed(error, str(path)) from None
     finally:
         sys.dont_write_bytecode = writes
         sys.path.remove(str(folder))
@@ -65,26 +62,33 @@ def load_module(
 
 def _installed(name: str) -> ModuleType:
     """Import a module by its name, or a model by its name among the entry points."""
-    try:
-        with contained():
+    with _running(name):
+        try:
             return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        if not f"{name}.".startswith(f"{error.name}."):  # what it imports is missing
-            raise _failed(error, name) from None
-    except Exception as error:
-        raise _failed(error, name) from None
+        except ModuleNotFoundError as error:
+            if not f"{name}.".startswith(f"{error.name}."):  # what it imports is missing
+                raise
     from importlib import metadata  # slow
 
     registered = {point.name: point for point in metadata.entry_points(group="grounded.models")}
     if name not in registered:
         raise unknown("module", name, registered, where="grounded.toml: [model] module")
     found = ModuleType(name)
+    with _running(name):
+        vars(found)["model"] = registered[name].load()
+    return found
+
+
+@contextlib.contextmanager
+def _running(name: str) -> Iterator[None]:
+    """Run the user's code, whose exceptions become messages with file and line."""
     try:
         with contained():
-            vars(found)["model"] = registered[name].load()
+            yield
+    except GroundedError as error:
+        raise error.at(name) from None
     except Exception as error:
         raise _failed(error, name) from None
-    return found
 
 
 def _forget_neighbours(folder: Path, before: set[str]) -> None:

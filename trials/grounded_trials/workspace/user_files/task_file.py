@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
@@ -102,13 +102,6 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
 
 SHAPE = NextCommand("target", ("SHAPE",))
 ROW_LIMIT = MAX_HORIZON + 2  # of target.csv; a longer one is not read to its end
-SMALLEST_RANGE = 0.1  # smallest range of a target column used for its weight
-# a column counts as constant if its range is below STILL_SHARE of its size (of SMALLEST_RANGE if
-# that is less), or below HARDLY in its unit
-STILL_SHARE, HARDLY = 0.01, 1e-4
-RATE = 0.1  # weight of a velocity beside its position, relative to that of other states
-NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
-UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
 FULL = {"%": (-100.0, 100.0)}  # range assumed for an input without limits, by unit
 CHANGE = 0.01  # weight on the changes of an input with range -1 to 1
 CHANGES = 4 * CHANGE
@@ -213,67 +206,6 @@ def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, floa
         for low, high, (name, unit) in both
         if math.isfinite(high - low)
     }
-
-
-def equal_weights(
-    columns: Mapping[str, Array],
-    units: Mapping[str, str],
-    together: Collection[str] = (),
-    rates: Collection[str] = (),
-) -> dict[str, float]:
-    """Return weights by which an error as large as a column's range costs 1.
-
-    That of a velocity beside its position costs RATE: its noise is a larger part of its range, and
-    a plan would leave the path for the sake of the speed.
-
-    A constant column has no range of its own. It gets the largest range or size among the columns
-    of its unit (a y that is constant while x moves; a step to a constant 5 m), or UNKNOWN if no
-    column of its unit moves or is larger than UNKNOWN.
-
-    Args:
-        columns: the columns of the target, by state.
-        units: the units of the model's states.
-        together: the axes of one position, which share a weight: that of the smallest range, but
-            of at least NARROW of the largest.
-        rates: the velocities of positions in the target (`off_target.rates_beside`).
-    """
-    ranges = {name: range_of(values) for name, values in columns.items()}
-    if axes := [own for name, own in ranges.items() if name in together and own > 0]:
-        narrow = max(min(axes), NARROW * max(axes))
-        ranges |= {name: narrow for name in ranges if name in together}
-    size: dict[str, float] = {}
-    for name, own in ranges.items():
-        unit = units.get(name, "")
-        size[unit] = max(size.get(unit, 0.0), own or float(np.abs(columns[name]).max()))
-    rest = {*without_range(columns, units)}
-    widths = {
-        name: max(own or (UNKNOWN if name in rest else size[units.get(name, "")]), SMALLEST_RANGE)
-        for name, own in ranges.items()
-    }
-    return {name: (RATE if name in rates else 1.0) * w**-2 for name, w in widths.items()}
-
-
-def range_of(values: Array) -> float:
-    """Return the range of a target column, 0 if it hardly moves (from 0.02591 to 0.0259 rad)."""
-    own = float(np.ptp(values))
-    return (
-        own
-        if own > max(STILL_SHARE * min(float(np.abs(values).max()), SMALLEST_RANGE), HARDLY)
-        else 0.0
-    )
-
-
-def without_range(columns: Mapping[str, Array], units: Mapping[str, str]) -> list[str]:
-    """Return the states for whose unit no column moves or exceeds UNKNOWN.
-
-    The target does not show what a small error of such a state is.
-    """
-    told = {
-        units.get(name, "")
-        for name, values in columns.items()
-        if range_of(values) > 0 or np.abs(values).max() > UNKNOWN
-    }
-    return [name for name in columns if units.get(name, "") not in told]
 
 
 def change_weight(limits: tuple[float, float] | None, unit: str) -> float:
