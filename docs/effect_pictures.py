@@ -33,7 +33,7 @@ from grounded.effects import (
     wrap,
 )
 from grounded.effects.medium import FAMILIES as MEDIUM
-from grounded.figures.figure import Figure, curve, panel
+from grounded.figures import Figure, curve, panel
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.models.car import model as car

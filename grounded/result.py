@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self, Union, get_args, get_orig
 from grounded.errors import GroundedError
 
 if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
+    from grounded.figures import Figure
 
 SCALED = ("m", "rad", "s")  # units that may get the prefixes m and µ, as may their rates
 PREFIX_BELOW = 1e-3  # values below this get a prefix
@@ -190,7 +190,7 @@ class Result:
         Raises:
             GroundedError: if there is nothing to draw, or Plotly is not installed.
         """
-        from grounded.figures.interactive import notebook_figure
+        from grounded.figures import notebook_figure
 
         figures = self.figures()
         if not figures:

@@ -42,7 +42,7 @@ from grounded.diagnosis.validation.decide import Decision, beside_lookalikes, de
 from grounded.diagnosis.validation.identifiable import held
 from grounded.diagnosis.validation.limits import knowable, sound_data, without_others
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.diagnosis.writer import MOST_EFFECTS, Writer
+from grounded.diagnosis.writer import MOST_EFFECTS, written
 from grounded.effects import Effect, Library, param_name
 from grounded.effects.actuator import delay, delay_again
 from grounded.engine import Engine, running, steady
@@ -169,18 +169,18 @@ def diagnose(
         tick("leftover")
         if not sound.limits.no_cause:
             decision = beside_lookalikes(decision)
-        written = Writer(
+        groups = [k < sound.first for k in range(data.count)]
+        tick("gap")
+        result = written(
             decision,
             ruler,
             sound,
-            (*options.but, *options.delays),
-            loop.most,
-            tick,
-            subject if isinstance(subject, Task) else None,
             uncertain,
+            adopted=(*options.but, *options.delays),
+            most=loop.most,
+            task=subject if isinstance(subject, Task) else None,
+            apart=compared(search, decision.fit, groups) if compare else None,
         )
-        groups = [k < sound.first for k in range(data.count)]
-        result = written.diagnosis(compared(search, decision.fit, groups) if compare else None)
 
     delays = _sensor_delays(result, data.model, options.but)
     older = late_as_positions(looked.findings, delays, options.but)

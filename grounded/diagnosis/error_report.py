@@ -312,12 +312,8 @@ def telling(rows: Sequence[RulerRow]) -> RulerRow | None:
 def states_told(row: RulerRow, tracked: Sequence[str] = ()) -> list[str]:
     """Return the states whose errors are told, best first.
 
-    They are those that improve enough to show, tracked ones first. If none does, it is the one that
-    is furthest off for its noise.
-
-    Args:
-        row: the errors.
-        tracked: the states that the task follows, the most important first.
+    They are those that improve enough to show, tracked ones first (the most important is first
+    among these). If none does, it is the one that is furthest off for its noise.
     """
     gains = {name: gain for name, gain in row.gains.items() if gain > SHOWS}
     order = {name: k for k, name in enumerate(tracked)}

@@ -31,7 +31,7 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.levels import SHOWS
 from grounded.diagnosis.telling import LINES, NEXT, accuracy_figure, instrument_lines, told
 from grounded.errors import NextCommand
-from grounded.figures.figure import Figure
+from grounded.figures import Figure
 from grounded.findings import Finding, found
 from grounded.result import Document, figure, html_table, number, or_zero, seen, spread, with_unit
 

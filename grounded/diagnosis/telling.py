@@ -24,7 +24,7 @@ from grounded.diagnosis.error_report import (
     telling,
 )
 from grounded.diagnosis.levels import ABOVE, SHOWS
-from grounded.figures.figure import Figure, Panel, curve, panel
+from grounded.figures import Figure, Panel, curve, panel
 from grounded.findings import Finding, Quantity, found, settle
 from grounded.findings.catalogue import entry_of
 from grounded.result import figure, measured, number, or_zero, percent, shown

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -33,6 +33,7 @@ from grounded.diagnosis.error_report import (
 from grounded.diagnosis.hypotheses.leftover import correction
 from grounded.diagnosis.levels import SURE
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
+from grounded.diagnosis.likelihood.noise import NoiseModel
 from grounded.diagnosis.likelihood.predictor import Predictor
 from grounded.diagnosis.parts import (
     Changed,
@@ -56,7 +57,7 @@ from grounded.diagnosis.validation.measured import (
     explained,
 )
 from grounded.diagnosis.validation.ruler import Ruler
-from grounded.effects import acting_order, wrapping_order
+from grounded.effects import Effect, acting_order, wrapping_order
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.model import Model
 from grounded.result import number
@@ -68,197 +69,187 @@ NAMED = 2  # most parameters in the words of a cause
 MENTIONED = 2  # most effects that one group of trials shows
 
 
-class Writer:
-    """Turns a decision into a Diagnosis.
+def written(
+    decision: Decision,
+    ruler: Ruler,
+    sound: Sound,
+    uncertain: Predictor,
+    *,
+    adopted: Collection[str],
+    most: int,
+    task: Task | None,
+    apart: tuple[Changed, ...] | None,
+) -> Diagnosis:
+    """Write a decision out.
 
     Args:
         decision: what is claimed.
         ruler: the held-out errors that it rests on.
         sound: the data, and what was found while they were made sound.
+        uncertain: evaluates hypotheses with those parameters free that the search held.
         adopted: adopted effects, whose values are parameters of the model.
         most: as many effects were looked for.
-        tick: called with the stage.
         task: the task, None for a model alone.
-        uncertain: evaluates hypotheses with those parameters free that the search held.
+        apart: what differs between two groups of trials, None without groups.
     """
+    best, search, left = decision.fit, decision.search, decision.left
+    data, states = search.data, search.data.model.state_names
+    trials = [trial for trial in sound.looked.trials if trial.known_steps >= 2]
+    measured = Measured(decision, ruler, trials, sound.first, sound.exact)
+    credit = {one.of: one.share for one in measured.credits}
+    claims = Claims(decision, credit, sound.limits, ruler, uncertain)
+    rows, remainder = measured.prediction_error(), measured.remainders()
+    ranking, groups = claims.ranking(measured), claims.groups()
+    named = [row.effect for row in ranking if row.claimed]
 
-    def __init__(
-        self,
-        decision: Decision,
-        ruler: Ruler,
-        sound: Sound,
-        adopted: Collection[str],
-        most: int,
-        tick: Callable[[str], None],
-        task: Task | None,
-        uncertain: Predictor,
-    ) -> None:
-        self.decision, self.ruler, self.known, self.task = decision, ruler, sound.limits, task
-        self.adopted, self.most, self.tick = adopted, most, tick
-        self.preflight, trials = sound.looked.findings, sound.looked.trials
-        self.trials = [trial for trial in trials if trial.known_steps >= 2]
-        self.best, self.data = decision.fit, decision.search.data
-        self.measured = Measured(decision, ruler, self.trials, sound.first, sound.exact)
-        credit = {one.of: one.share for one in self.measured.credits}
-        self.claims = Claims(decision, credit, self.known, ruler, uncertain)
+    # where the gap is; without a cause or a leftover it is noise, and shares tell nothing
+    gain = explained(ruler.predictor, Hypothesis(), best)
+    if left:
+        gain = gain.copy()
+        gain[..., states.index(left[0].channel)] += left[0].improvement
+    located = bool(named or remainder)
+    if remainder and not named:  # what is left elsewhere is no gap
+        off_too = [states.index(one.channel) for one in remainder]
+        gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
+    total, region = gain.sum(axis=-1), by_region if located else lambda *_: []
+    where = Where(
+        channels=_channels(ruler, gain if located else np.full_like(gain, np.nan), rows),
+        times=tuple(by_time(total, data)) if located else (),
+        regions=tuple(region(total, ruler.predictor, best)),
+        whiteness=measured.whiteness,
+        tempering=search.tempering.factor,
+    )
+    gap = Gap(
+        horizon_s=ruler.steps[-1] * data.dt,
+        unit="noise-normalised rms",
+        before=measured.gap(decision.crude),
+        after=measured.gap(best),
+        floor=1.0,
+        held_out=ruler.held_out,
+    )
 
-    def diagnosis(self, apart: tuple[Changed, ...] | None = None) -> Diagnosis:
-        """All of it; `apart` is what differs between two groups of trials, if there are two."""
-        self.tick("gap")
-        data, best, ruler, measured = self.data, self.best, self.ruler, self.measured
-        states, left = data.model.state_names, self.decision.left
-        rows, remainder = measured.prediction_error(), measured.remainders()
-        ranking, groups = self.claims.ranking(measured), self.claims.groups()
-        named = [row.effect for row in ranking if row.claimed]
+    # log scores of the crude model, the choice and the reference
+    choice, crude = decision.choice, ruler.score(decision.crude)
+    chosen = crude + ruler.gain(decision.crude, best).mean
+    values, agreement = by_trial(best, data, named) if named else ((), ())
+    ids = [name or f"#{i + 1}" for i, name in enumerate(data.ids)]
+    said = Diagnosis(
+        verdict=Verdict("unknown"),
+        where=where,
+        ranking=ranking,
+        indistinguishable=groups,
+        equivalent=claims.equivalent(groups),
+        gap=gap,
+        leftover=remainder,
+        unconfirmed=unconfirmed(claims, decision.doubtful, groups),
+        correction=correction(ruler, best, left),
+        noise=_noise(best.noise, ruler),
+        parameters=claims.parameters(),
+        identifiable=claims.identified.parameters,
+        combinations=claims.identified.combinations,
+        prediction_error=rows,
+        credit=measured.credits,
+        per_trial=values,
+        agreement=agreement,
+        changed=apart,
+        trials=data.count,
+        groups=tuple(
+            TrialGroup(f"g{k}", tuple(ids[i] for i in group.trials), group.differs_in)
+            for k, group in enumerate(data.groups, 1)
+        ),
+        held_out=ruler.by,
+        score=Score(crude, chosen, chosen + choice.lost, choice.standard_error),
+        steps=data.steps,
+        candidates=len(search.candidates),
+        preflight=sound.looked.findings,
+        made=Made(nominal=dict(zip(data.model.params, data.model.values.tolist(), strict=True))),
+        tracked=() if task is None else _tracked(task),
+    )
 
-        # where the gap is; without a cause or a leftover it is noise, and shares tell nothing
-        gain = explained(ruler.predictor, Hypothesis(), best)
-        if left:
-            gain = gain.copy()
-            gain[..., states.index(left[0].channel)] += left[0].improvement
-        located = bool(named or remainder)
-        if remainder and not named:  # what is left elsewhere is no gap
-            off_too = [states.index(one.channel) for one in remainder]
-            gain = np.where(np.isin(np.arange(gain.shape[-1]), off_too), gain, 0.0)
-        total, region = gain.sum(axis=-1), by_region if located else lambda *_: []
-        where = Where(
-            channels=self.channels(gain if located else np.full_like(gain, np.nan), rows),
-            times=tuple(by_time(total, data)) if located else (),
-            regions=tuple(region(total, ruler.predictor, best)),
-            whiteness=measured.whiteness,
-            tempering=self.decision.search.tempering.factor,
-        )
-        gap = Gap(
-            horizon_s=ruler.steps[-1] * data.dt,
-            unit="noise-normalised rms",
-            before=measured.gap(self.decision.crude),
-            after=measured.gap(best),
-            floor=1.0,
-            held_out=ruler.held_out,
-        )
-        values, agreement = by_trial(best, data, named) if named else ((), ())
-        identified, parameters = self.claims.identified, self.claims.parameters()
-        ids = [name or f"#{i + 1}" for i, name in enumerate(data.ids)]
-        written = Diagnosis(
-            verdict=Verdict("unknown"),
-            where=where,
-            ranking=ranking,
-            indistinguishable=groups,
-            equivalent=self.claims.equivalent(groups),
-            gap=gap,
-            leftover=remainder,
-            unconfirmed=unconfirmed(self.claims, self.decision.doubtful, groups),
-            correction=correction(ruler, best, left),
-            noise=self.noise(),
-            parameters=parameters,
-            identifiable=identified.parameters,
-            combinations=identified.combinations,
-            prediction_error=rows,
-            credit=measured.credits,
-            per_trial=values,
-            agreement=agreement,
-            changed=apart,
-            trials=data.count,
-            groups=tuple(
-                TrialGroup(f"g{k}", tuple(ids[i] for i in group.trials), group.differs_in)
-                for k, group in enumerate(data.groups, 1)
-            ),
-            held_out=ruler.by,
-            score=self.score(),
-            steps=data.steps,
-            candidates=len(self.decision.search.candidates),
-            preflight=self.preflight,
-            made=Made(
-                nominal=dict(zip(data.model.params, data.model.values.tolist(), strict=True))
-            ),
-            tracked=() if self.task is None else _tracked(self.task),
-        )
-        said = self.verdict(written)
-        acting = _in_action(best.hypothesis, said.effects)
-        written = replace(written, verdict=said, acting=acting)
-        return replace(written, findings=self.findings(written))
+    # the verdict, what is told beside it, and the next step
+    limits = sound.limits
+    if limits.no_cause:
+        verdict = Verdict("unknown", limit=limits.findings[0].code)
+    else:
+        off = tuple(data.model.param_names[i] for i in claims.moved)
+        full = len(claims.names) == most
+        verdict = verdict_of(said, off, best.hypothesis.effects, adopted, full=full)
+    said = replace(said, verdict=verdict, acting=_in_action(best.hypothesis, verdict.effects))
+    more = [found("gap.more", most=most)] * verdict.again
+    step = next_step(said, trials, adopted)
+    told = (*limits.findings, *more, *remarks(said, data.model, adopted), step)
+    return replace(said, findings=told)
 
-    def findings(self, d: Diagnosis) -> tuple[Finding, ...]:
-        """What is told beside the diagnosis' lines, and the next step."""
-        more = [found("gap.more", most=self.most)] * d.verdict.again
-        step = next_step(d, self.trials, self.adopted)
-        return (*self.known.findings, *more, *remarks(d, self.data.model, self.adopted), step)
 
-    def verdict(self, d: Diagnosis) -> Verdict:
-        """The kind of the verdict, and the causes in words."""
+def verdict_of(
+    d: Diagnosis,
+    off: Sequence[str],
+    effects: Sequence[Effect],
+    adopted: Collection[str],
+    *,
+    full: bool,
+) -> Verdict:
+    """Return the verdict where causes can be named; `full`: as many are as were looked for."""
+    claimed = tuple(row.effect for row in d.ranking if row.claimed)
+    if not claimed:
         row = furthest(d.prediction_error)
-        if self.known.no_cause:
-            return Verdict("unknown", limit=self.known.findings[0].code)
-        claimed = tuple(row.effect for row in d.ranking if row.claimed)
-        if not claimed:
-            bound = row is not None and row.floor_at_most
-            unsure = bound and not excess(d.prediction_error) and not self.adopted
-            return Verdict("unknown" if d.leftover or unsure else "none")
-        off = tuple(self.data.model.param_names[i] for i in self.claims.moved)
-        return Verdict(
-            "effect" if len(claimed) == 1 else "several",
-            effects=claimed,
-            causes=self.causes(d, off),
-            parameters=off,
-            again=len(self.claims.names) == self.most and any(one.above for one in d.leftover),
-        )
+        bound = row is not None and row.floor_at_most
+        unsure = bound and not excess(d.prediction_error) and not adopted
+        return Verdict("unknown" if d.leftover or unsure else "none")
+    return Verdict(
+        "effect" if len(claimed) == 1 else "several",
+        effects=claimed,
+        causes=_causes(d, off, effects, adopted),
+        parameters=tuple(off),
+        again=full and any(one.above for one in d.leftover),
+    )
 
-    def causes(self, d: Diagnosis, off: Sequence[str]) -> tuple[str, ...]:
-        """The words of each cause, the largest first; of parameters, all that are adopted count."""
-        effects = {effect.name: effect for effect in self.best.hypothesis.effects}
-        called = [value_called(name, self.adopted) for name in off]
-        each = [
-            f"{c} = {d.parameters[n].text}, was {number(d.made.nominal[n])}"
-            for c, n in zip(called, off, strict=True)
-        ]
-        shown = each if len(off) <= NAMED else called[:NAMED]
-        rest = len({*off, *d.adoptable}) - len(shown)
-        words = (*shown, *[f"{rest} more"] * (rest > 0))
-        values = words if len(off) <= NAMED else None
-        own = found("model.off", values=values, names=words).sentence
-        return tuple(
-            meaning(effects[one.of], row.params)
-            if one.of in effects and (row := d.ranked(one.of))
-            else own
-            for one in d.credit
-        )
 
-    def score(self) -> Score:
-        """Log scores of the crude model, the choice and the reference."""
-        ruler, choice = self.ruler, self.decision.choice
-        crude = ruler.score(self.decision.crude)
-        chosen = crude + ruler.gain(self.decision.crude, self.best).mean
-        return Score(crude, chosen, chosen + choice.lost, choice.standard_error)
+def _causes(
+    d: Diagnosis, off: Sequence[str], effects: Sequence[Effect], adopted: Collection[str]
+) -> tuple[str, ...]:
+    """The words of each cause, the largest first; of parameters, all that are adopted count."""
+    called = [value_called(name, adopted) for name in off]
+    each = [
+        f"{c} = {d.parameters[n].text}, was {number(d.made.nominal[n])}"
+        for c, n in zip(called, off, strict=True)
+    ]
+    shown = each if len(off) <= NAMED else called[:NAMED]
+    rest = len({*off, *d.adoptable}) - len(shown)
+    words = (*shown, *[f"{rest} more"] * (rest > 0))
+    values = words if len(off) <= NAMED else None
+    own = found("model.off", values=values, names=words).sentence
+    by_name = {effect.name: effect for effect in effects}
+    return tuple(
+        meaning(by_name[one.of], row.params)
+        if one.of in by_name and (row := d.ranked(one.of))
+        else own
+        for one in d.credit
+    )
 
-    def channels(self, gain: Any, rows: Sequence[RulerRow]) -> tuple[ChannelShare, ...]:
-        """Each state's part of the gap, NaN of NaN, with the ruler's errors a second ahead."""
-        excess = np.maximum(gain.sum(axis=(0, 1)), 0.0)
-        share = excess / max(float(excess.sum()), 1e-12)
-        ahead = furthest(rows) or rows[0]
-        found = [
-            ChannelShare(
-                name,
-                share=float(share[i]),
-                rms=ahead.crude[name],
-                unit=self.data.model.states[name],
-                noise=ahead.noise_floor[name],
-            )
-            for i, name in zip(self.ruler.shown, self.ruler.names, strict=True)
-        ]
-        return tuple(sorted(found, key=lambda one: -np.nan_to_num(one.share)))
 
-    def noise(self) -> NoiseLevels:
-        """The noise as it was estimated."""
-        noise = self.best.noise
-        tau = noise.structure.tau
-        q, r = np.exp(0.5 * noise.log_q), np.exp(0.5 * noise.log_r)
-        shown = [*zip(self.ruler.shown, self.ruler.names, strict=True)]
-        return NoiseLevels(
-            process={name: float(q[i]) for i, name in shown},
-            measurement={name: float(r[i]) for i, name in shown},
-            correlation_s=np.nan if tau is None else tau,
-            outliers=not isinstance(noise.weight_v, float),
-        )
+def _channels(ruler: Ruler, gain: Any, rows: Sequence[RulerRow]) -> tuple[ChannelShare, ...]:
+    """Each state's part of the gap, NaN of NaN, with the ruler's errors a second ahead."""
+    above = np.maximum(gain.sum(axis=(0, 1)), 0.0)
+    share, ahead = above / max(float(above.sum()), 1e-12), furthest(rows) or rows[0]
+    units = ruler.predictor.data.model.states
+    each = (
+        ChannelShare(name, float(share[i]), ahead.crude[name], units[name], ahead.noise_floor[name])
+        for i, name in zip(ruler.shown, ruler.names, strict=True)
+    )
+    return tuple(sorted(each, key=lambda one: -np.nan_to_num(one.share)))
+
+
+def _noise(noise: NoiseModel, ruler: Ruler) -> NoiseLevels:
+    """The noise as it was estimated."""
+    tau, shown = noise.structure.tau, [*zip(ruler.shown, ruler.names, strict=True)]
+    q, r = np.exp(0.5 * noise.log_q), np.exp(0.5 * noise.log_r)
+    return NoiseLevels(
+        process={name: float(q[i]) for i, name in shown},
+        measurement={name: float(r[i]) for i, name in shown},
+        correlation_s=np.nan if tau is None else tau,
+        outliers=not isinstance(noise.weight_v, float),
+    )
 
 
 def _tracked(task: Task) -> tuple[str, ...]:
@@ -284,13 +275,7 @@ def unconfirmed(
     doubtful: Sequence[Doubtful],
     groups: Sequence[Sequence[str]] = (),
 ) -> tuple[Unconfirmed, ...]:
-    """Return the likeliest effects that only one group of trials shows, without ties.
-
-    Args:
-        claims: the causes that are claimed.
-        doubtful: the likely effects that were dropped.
-        groups: effects that the data cannot tell apart.
-    """
+    """Return the likeliest of the dropped effects that one group of trials shows, without ties."""
     tied = {name for group in groups for name in group}
     found = [
         Unconfirmed(
@@ -311,13 +296,7 @@ def quantity(e: Estimate) -> Quantity:
 
 
 def remarks(d: Diagnosis, model: Model, adopted: Collection[str] = ()) -> Iterator[Finding]:
-    """Yield what a person should know beside the verdict, the errors and the gap.
-
-    Args:
-        d: the diagnosis.
-        model: the model that was diagnosed.
-        adopted: adopted effects, whose values are parameters of the model.
-    """
+    """Yield what a person should know beside the verdict, the errors and the gap."""
     if d.no_cause:
         return
     yield from _of_groups(d, adopted)
@@ -436,13 +415,7 @@ def _of_model(d: Diagnosis, model: Model) -> Iterator[Finding]:
 
 
 def next_step(d: Diagnosis, trials: Sequence[Trial], adopted: Collection[str] = ()) -> Finding:
-    """Return what to do next.
-
-    Args:
-        d: the diagnosis.
-        trials: those that were diagnosed.
-        adopted: adopted effects, whose values are parameters of the model.
-    """
+    """Return what to do next."""
     if d.no_cause:
         return found("gap.next.record")
     if d.changed:

@@ -15,7 +15,7 @@ from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
+    from grounded.figures import Figure
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
@@ -143,7 +143,7 @@ class Candidate(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of the predicted states and inputs over time."""
-        from grounded.figures.figure import Figure, curve, panel
+        from grounded.figures import Figure, curve, panel
 
         columns = [*zip(self.policy.state_names, self.predicted_states.T, strict=True)]
         columns += zip(self.policy.input_names, self.predicted_inputs.T, strict=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.figures.figure import Figure, Panel, Trace, band, curve, marks, panel
+from grounded.figures import Figure, Panel, Trace, band, curve, marks, panel
 from grounded.result import figure
 from grounded.search.candidate import Tried
 

@@ -33,7 +33,7 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 if TYPE_CHECKING:
-    from grounded.figures.figure import Figure
+    from grounded.figures import Figure
 
 
 class Phase(StrEnum):

@@ -15,7 +15,7 @@ from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.parts import Diagnosis, Ranked, Verdict
 from grounded.diagnosis.validation.claims import fewest
 from grounded.diagnosis.validation.ruler import repeated
-from grounded.diagnosis.writer import Writer
+from grounded.diagnosis.writer import verdict_of
 from grounded.effects import Library, wrap
 from grounded.models.pendulum import model as pendulum
 from grounded.search.design import probe
@@ -123,11 +123,9 @@ def test_where_as_many_as_were_looked_for_leave_more_than_noise_more_are_looked_
 ):
     claimed = [f"viscous_friction:{k}" for k in range(max(most, 3))]
     rows = tuple(Ranked(name, {}, {}, 50.0, claimed=True) for name in claimed)
-    claims = SimpleNamespace(moved=(), names=claimed)
     left = (Remainder("u", 0.1, "m/s^2", 9.0, None, error, 0.032, 1.0, "m/s", True),)
-    writer = SimpleNamespace(claims=claims, adopted=(), most=most, causes=lambda *args: ())
-    writer.known = SimpleNamespace(no_cause=False)
-    found = Writer.verdict(writer, Diagnosis(Verdict("several"), ranking=rows, leftover=left))
+    said = Diagnosis(Verdict("several"), ranking=rows, leftover=left)
+    found = verdict_of(said, (), (), (), full=len(claimed) == most)
     assert found.again is more
 
 

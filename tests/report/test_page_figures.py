@@ -14,7 +14,7 @@ from grounded.diagnosis.error_report import RulerRow
 from grounded.diagnosis.parts import Diagnosis, Verdict
 from grounded.diagnosis.telling import accuracy_figure
 from grounded.experiments.pendulum import pendulum_task
-from grounded.figures.figure import Figure, curve, log_ticks, marks, panel, rule
+from grounded.figures import Figure, curve, log_ticks, marks, panel, rule
 from grounded.model import Model
 from grounded.models import arm, car, cart_pole, pendulum
 from grounded.rollout import simulate

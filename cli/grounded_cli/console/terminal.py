@@ -134,13 +134,7 @@ def show_json(document: dict[str, Any]) -> None:
 
 
 def lines(text: str, first: str, rest: str) -> list[str]:
-    """Wrap a text to the terminal's width, with `-C DIR` added to its commands where needed.
-
-    Args:
-        text: the text.
-        first: the prefix of the first line.
-        rest: the prefix of the other lines.
-    """
+    """Wrap a text to the terminal's width, with `-C DIR` added to its commands where needed."""
     return wrapped(placed(text, given()), first, rest)
 
 
@@ -162,11 +156,8 @@ def tell(
 ) -> None:
     """Write findings to stderr as remarks, the heaviest first; beyond `most`, how many are left.
 
-    Args:
-        findings: as `settle` orders them.
-        about: what all are about, such as the name of a log.
-        most: how many are told; the others are in the JSON document and with --details.
-        all_: tell them all, with their codes, as --details does.
+    `about` is what all are about, such as the name of a log; `all_` tells them all, with their
+    codes, as --details does.
     """
     most = len(findings) if all_ else most
     for one in findings[:most]:
@@ -359,12 +350,7 @@ def open_workspace() -> Workspace:
 
 
 def typed(then: NextCommand, folder: str | None = None) -> str:
-    """Format a command so that it works from the user's current folder.
-
-    Args:
-        then: the command.
-        folder: the workspace for its -C; None: that of the -C given to this command.
-    """
+    """Format a command so that it works from here; `folder`: for its -C, None for that given."""
     if folder is None and then.verb not in ELSEWHERE:
         folder = given()
     return rendered(then, folder)

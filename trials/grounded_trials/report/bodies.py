@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.figures.figure import Body
+from grounded.figures import Body
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task

@@ -26,8 +26,8 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from grounded.figures.figure import COLOURS as PAGE
-from grounded.figures.figure import Body, Figure, Panel, rgb, typeset
+from grounded.figures import COLOURS as PAGE
+from grounded.figures import Body, Figure, Panel, rgb, typeset
 from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.plain_file import unwritable

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from grounded.errors import needs
-from grounded.figures.figure import Figure, typeset
+from grounded.figures import Figure, typeset
 from grounded.result import Result
 from grounded_trials.report.figures.png import png as drawn
 from grounded_trials.report.figures.runs import all_figures

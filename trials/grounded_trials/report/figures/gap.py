@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.figures.figure import Figure, calm_range, curve, panel
+from grounded.figures import Figure, calm_range, curve, panel
 from grounded.trial import Trial
 from grounded_trials.report.bodies import reading_order
 from grounded_trials.report.findings import ESTIMATED, Findings, Log, Run

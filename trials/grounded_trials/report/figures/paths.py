@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from grounded.figures.figure import (
+from grounded.figures import (
     WIDTHS,
     Figure,
     Trace,

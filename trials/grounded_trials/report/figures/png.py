@@ -7,8 +7,7 @@ import textwrap
 from typing import Any
 
 from grounded.errors import needs
-from grounded.figures.figure import Figure, Key, Panel, Trace, key_trace, typeset
-from grounded.figures.interactive import PALETTE
+from grounded.figures import PALETTE, Figure, Key, Panel, Trace, key_trace, typeset
 
 WIDE, HIGH, SQUARE = 4.8, 2.7, 4.4  # [inch] of a panel
 DPI = 200

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from grounded.diagnosis.telling import accuracy_figure
-from grounded.figures.figure import (
+from grounded.figures import (
     STEPS,
     Figure,
     Panel,

@@ -28,8 +28,7 @@ from grounded.diagnosis.telling import (
 )
 from grounded.diagnosis.telling import error_table as held_out_table
 from grounded.errors import NextCommand, needs
-from grounded.figures.figure import Panel, typeset
-from grounded.figures.interactive import PALETTE
+from grounded.figures import PALETTE, Panel, typeset
 from grounded.result import begun
 from grounded.search.difference import last_gain
 from grounded_trials.report.figures.runs import all_figures

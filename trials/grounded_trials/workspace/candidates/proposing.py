@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from grounded.diagnosis.parts import Diagnosis
-    from grounded.figures.figure import Figure
+    from grounded.figures import Figure
     from grounded.search.candidate import Candidate
     from grounded.search.standing import Proposal, Standing
 

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from grounded.errors import needs
 from grounded.frozen import Array
 
 # Okabe & Ito (2008), distinguishable with colour blindness: role -> (on white, on black)
@@ -31,6 +32,11 @@ COLOURS = {
     "step2": ("#b47c00", "#f0e442"),
     "step3": ("#6f6f6f", "#8d8d8d"),
 }
+PALETTE = COLOURS | {
+    "text": ("#1a1a1a", "#e8e8e8"),
+    "grid": ("#e3e3e3", "#31363b"),
+    "paper": ("#ffffff", "#16181b"),
+}
 STEPS = ("step1", "step2", "step3")  # roles of iterations, in order
 WIDTHS = {"best": 2.5, "desired": 1.0}  # line widths of paths; 1.5 for the other roles
 DASHES = {
@@ -45,6 +51,7 @@ SMALLEST_RANGE = 1e-12  # range below which differences are rounding errors
 MOST_POINTS = 1600  # most points of a curve
 CONTEXT = 300  # most points of a curve that is only context
 TICKS = 5  # most ticks of a logarithmic axis
+HEIGHT, SPACE = 200, 100  # of a row of panels in a notebook, and between rows [px]
 Trace = dict[str, Any]
 
 
@@ -153,7 +160,7 @@ def curve(
         width: of the line [px].
         style: line, steps (each y holds until the next x), points, or ghost: not drawn, only for
             the marks of the page's slider.
-        trial: the trial whose path it is, so that the slider finds it.
+        trial: the trial whose path it is.
         times: (T,) time of each point of a path [s].
         note: text shown before y on hovering.
     """
@@ -211,17 +218,9 @@ def marks(
     errors: Sequence[float] = (),
     trial: str = "",
 ) -> Trace:
-    """Return marks of one look, with the texts shown on hovering.
+    """Return marks with the texts `notes` on hovering, and error bars of half heights `errors`.
 
-    Args:
-        x: positions.
-        y: values; one that is not finite is drawn on the lower edge.
-        role: their colour.
-        notes: a text for each.
-        shape: one of SYMBOLS.
-        name: their name in the legend.
-        errors: half the heights of error bars, () for none.
-        trial: the trial whose marks they are.
+    A value that is not finite is drawn on the lower edge.
     """
     size, width = (9, 1.5) if shape in ("disc", "ring") else (11, 2.5)
     look = {"color": f"@{role}", "line": {"color": f"@{role}", "width": width}}
@@ -259,7 +258,7 @@ def panel(
     """Return axes that contain every named curve, every mark and every rule.
 
     Args:
-        title: of the panel.
+        title: see `Panel`.
         x_name: title of the x axis.
         y_name: title of the y axis.
         traces: made by `curve` and `marks`.
@@ -270,7 +269,7 @@ def panel(
         whole: x values are whole numbers.
         x_ticks: positions and labels of ticks; () for automatic.
         y_range: ends of the y axis, if not those of the contents.
-        note: text behind the title.
+        note: see `Panel`.
         kind: see `Panel`.
     """
     if loss:
@@ -417,3 +416,70 @@ def thinned(x: Array, y: Array, most: int) -> NDArray[np.intp]:
     starts, ends = np.r_[0, edges], np.r_[edges, count] - 1
     breaks = np.flatnonzero(np.diff(known))
     return np.unique(np.concatenate([starts, ends, order[starts], order[ends], breaks, breaks + 1]))
+
+
+# in a notebook
+
+
+def _coloured(value: Any) -> Any:
+    """Replace the roles in a trace or layout by colours on white."""
+    if isinstance(value, dict):
+        return {key: _coloured(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return [_coloured(item) for item in value]
+    if not (isinstance(value, str) and value.startswith("@")):
+        return value
+    role, _, opacity = value[1:].partition("/")
+    colour = PALETTE[role][0]
+    return f"rgba({','.join(map(str, rgb(colour)))},{opacity})" if opacity else colour
+
+
+def notebook_figure(figures: Sequence[Figure]) -> Any:
+    """Return all panels of some figures as one Plotly figure, two side by side.
+
+    Raises:
+        GroundedError: if Plotly is not installed.
+    """
+    needs("plotly", "notebook")
+    from plotly.graph_objects import Figure as Drawn
+    from plotly.subplots import make_subplots
+
+    panels = [panel for figure in figures for panel in figure.panels]
+    columns, rows = min(2, len(panels)), -(-len(panels) // 2)
+    if not panels:
+        return Drawn()
+    total = (HEIGHT + SPACE) * rows
+    titles = [f"{p.title}<br><sub>{p.note}</sub>" if p.note else p.title for p in panels]
+    made = make_subplots(
+        rows=rows, cols=columns, subplot_titles=titles, horizontal_spacing=0.12,
+        vertical_spacing=SPACE / total,
+    )  # fmt: skip
+
+    # the traces, each name once in the legend
+    named = set[tuple[str, str]]()
+    for k, panel in enumerate(panels):
+        at = {"row": k // 2 + 1, "col": k % 2 + 1}
+        for trace in _coloured([*panel.data]):
+            known, meta = (str(trace.get("line")), trace["name"]), trace.pop("meta")
+            context = meta["role"] == "other" and meta["trial"]
+            shows = bool(trace["name"]) and known not in named and not context
+            made.add_trace(trace | {"showlegend": shows, "legendgroup": trace["name"]}, **at)
+            named.add(known)
+        layout = _coloured(dict(panel.layout))
+        if "scaleanchor" in layout["yaxis"]:
+            layout["yaxis"]["scaleanchor"] = f"x{k + 1 if k else ''}"
+        made.update_xaxes(layout["xaxis"], **at)
+        made.update_yaxes(layout["yaxis"], **at)
+        for shape in layout.get("shapes", ()):
+            made.add_shape(shape, **at)
+    keys = {(k.role, k.name): k for figure in figures for k in figure.key if not k.trial}
+    for key in keys.values():
+        if all(key.name != name for _, name in named):  # rules and bands are no traces
+            made.add_trace(_coloured(key_trace(key)))
+
+    made.update_layout(
+        height=total + 80, template="plotly_white", margin={"t": 90, "b": 40, "l": 80},
+        title={"text": figures[0].title} if len(figures) == 1 else None,
+        legend={"orientation": "h", "yanchor": "top", "y": -70 / (total + 80)}, showlegend=True,
+    )  # fmt: skip
+    return made
