@@ -83,13 +83,8 @@ class Engine:
 def processes(engine: Engine, function: Callable[[Any], T], rows: Sequence[Any]) -> Iterator[T]:
     """Yield function(row) of all rows as they are found, in any order.
 
-    Args:
-        engine: how many processes.
-        function: a module-level function; it, its arguments and results must be picklable.
-        rows: its arguments.
-
-    Raises:
-        BrokenProcessPool: if a process ended by itself.
+    The function is one of a module; it, its arguments and results must be picklable. A process that
+    ends by itself raises BrokenProcessPool.
     """
     if engine.jobs == 1:
         yield from map(function, rows)
@@ -111,9 +106,7 @@ _pool: ContextVar[Call | None] = ContextVar("pool", default=None)
 def running(engine: Engine | None, *, copied: bool = True) -> Iterator[None]:
     """Make `each` use this engine inside the block; None: run in this process.
 
-    Args:
-        engine: the workers.
-        copied: whether pieces may run in copies of this process; False if they step a simulator.
+    Pieces that step a simulator must not run in copies of this process (`copied`).
     """
     if engine is None or engine.jobs == 1:
         yield
@@ -164,10 +157,7 @@ def each(
 ) -> list[T]:
     """Return [function(*row) for row in zip(*columns)], computed on the engine of `running`.
 
-    Args:
-        function: must not modify shared data.
-        columns: sequences of arguments, all of the same length.
-        done: called after each piece.
+    The function must not modify shared data; `done` is called after each piece.
     """
     rows, results = list(zip(*columns, strict=True)), dict[int, T]()
     call = (_pool.get() if len(rows) > 1 else None) or _alone

@@ -84,11 +84,7 @@ class Record:
         return len(self.times) - 1
 
     def received(self, latency: Array) -> Array:
-        """Return the inputs received over each step, (T, m).
-
-        Args:
-            latency: latency of each input [s], (m,).
-        """
+        """Return the inputs received over each step, (T, m), with the latency [s] of each (m,)."""
         total = [self._integral(self.times - late, j) for j, late in enumerate(latency)]
         return np.diff(np.stack(total, axis=1), axis=0) / np.diff(self.times)[:, None]
 

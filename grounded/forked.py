@@ -58,12 +58,7 @@ class Forks:
     def __call__(
         self, function: Callable[..., Any], rows: Sequence[Any]
     ) -> Generator[tuple[int, Any], None, None]:
-        """Yield (k, function(*rows[k])) for all k, as they are found.
-
-        Args:
-            function: must not modify what it is given.
-            rows: arguments of each piece.
-        """
+        """Yield (k, function(*rows[k])) for all k, as they are found."""
         left = dict(enumerate(rows))
         if function not in self._took:
             yield 0, self._here(function, left.pop(0))

@@ -114,12 +114,7 @@ def _seen(by_orders: Array) -> Array:
 
 
 def wrapped(d: Array, angles: ArrayLike) -> Array:
-    """Wrap the angles among the first n entries of `d` to [-pi, pi], in place, and return `d`.
-
-    Args:
-        d: differences (..., >= n).
-        angles: (n,) bool, which entries are angles.
-    """
+    """Wrap the angles (n,) bool among the first entries of `d` (..., >= n), in place; return d."""
     for i in np.asarray(angles).nonzero()[0].tolist():  # np.flatnonzero takes ten times as long
         column = d[..., i]
         column -= 2 * np.pi * np.rint(column / (2 * np.pi))

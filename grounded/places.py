@@ -399,14 +399,9 @@ def partner(model: Model, target: str) -> str | None:
 
 
 def true_values(names: Sequence[str], memory: Collection[str]) -> dict[int, int]:
-    """Return the memory states that hold true values behind a delayed log.
+    """Return {memory state that holds true values behind a delayed log: state that logs it}.
 
-    Args:
-        names: names of all states, (n,).
-        memory: those that adopted effects added.
-
-    Returns:
-        {index of the memory state: index of the state that logs it}.
+    By their indices among all names (n,), of which adopted effects added those in `memory`.
     """
     own = [(k, n) for k, n in enumerate(names) if n not in memory]
     return {

@@ -144,12 +144,7 @@ class Policy:
         return replace(self, feedforward=moved, reference=reference)
 
     def toward(self, other: Policy, alpha: float) -> Policy:
-        """Return theta + alpha (theta' - theta) (footnote 11), with theta' the other policy.
-
-        Args:
-            other: the policy at alpha = 1, returned as it is there.
-            alpha: step size.
-        """
+        """Return theta + alpha (theta' - theta) (footnote 11), with theta' the other policy."""
         if alpha == 1.0:
             return other
         if self.z_names != other.z_names:
@@ -201,11 +196,8 @@ class Policy:
     ) -> Array:
         """Add the feedback from the policy's own past commands (B, T, m), step by step, and clip.
 
-        Args:
-            asked: (B, T, m) the commands without it.
-            past: (m,) the input held before the first step.
-            memory: (T, m, sum(depths)) gains on past inputs.
-            places: for each of these gains, its input, and its row among the last commands.
+        For each of the gains (T, m, sum(depths)) in `memory`, `places` has the input, and its row
+        among the last commands.
         """
         B, T, m = asked.shape
         oldest = max(self.depths)
@@ -230,12 +222,7 @@ def z_difference(a: Array, b: Array, angles: tuple[bool, ...]) -> Array:
 
 
 def to_arrays(policy: Policy, **about: str) -> dict[str, Any]:
-    """Return a policy as arrays and strings for `numpy.savez`.
-
-    Args:
-        policy: the policy.
-        about: further strings to store, such as `task`, which a reader may check.
-    """
+    """Return a policy as arrays for `numpy.savez`, with strings that a reader may check."""
     arrays: dict[str, Any] = {name: getattr(policy, name) for name in NUMBERS}
     arrays |= {
         "format": FORMAT,

@@ -16,11 +16,7 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
-    """Turn Ctrl-C into `Interrupted` with the result so far.
-
-    Args:
-        so_far: returns that text; called only on Ctrl-C.
-    """
+    """Turn Ctrl-C into `Interrupted` with the result so far, which is asked for only then."""
     try:
         yield
     except Interrupted:

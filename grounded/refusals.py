@@ -15,14 +15,7 @@ MOST_NAMES = 12  # most names listed in a message; of more the nearest ones
 
 
 def refused(code: str, *about: object, then: Any = None, **facts: Any) -> GroundedError:
-    """Return the error of a finding.
-
-    Args:
-        code: its entry in the catalogue.
-        about: what it is about.
-        then: the command that mends it.
-        **facts: by slot; those that are None are left out.
-    """
+    """Return the error of a finding; facts that are None are left out."""
     names = [str(one) for one in about]
     return GroundedError(found(code, *names, then=then, weight=Weight.REFUSE, **facts))
 
@@ -56,12 +49,7 @@ def unknown(
 ) -> GroundedError:
     """Return an error about a name that is not among those that exist.
 
-    Args:
-        kind: what it should name, such as "state".
-        name: what was given.
-        valid: the names that exist.
-        of: what has them, such as "model 'car'".
-        where: the file or key that has the name.
+    `kind` is what it should name, such as "state", `of` what has those, such as "model 'car'".
     """
     place = {"where": where} if where else {}
     return refused("given.name", name, kind=kind, of=of, **place, **near(str(name), valid))

@@ -76,26 +76,16 @@ def _simulated(problem: Problem, policy: Policy) -> Rollout:
 
 
 def seen_late(states: Array, steps: float, angles: Sequence[bool]) -> Array:
-    """Return what a policy sees of states less the states themselves, if its samples are old.
+    """Return what a policy sees of states (H, n) less these, if its samples are old by some steps.
 
     To first order, that is the change since the step before, times the age; 0 at the first step.
-
-    Args:
-        states: (H, n), one row a control step.
-        steps: age of the samples, in steps.
-        angles: (n,) which states wrap.
     """
     with np.errstate(all="ignore"):
         return -steps * wrapped(np.diff(states, axis=0, prepend=states[:1]), angles)
 
 
 def for_late_samples(policy: Policy, problem: Problem) -> Policy:
-    """Return a policy about true states as one about what the robot sees of them.
-
-    Args:
-        policy: planned as if the robot saw its state at once.
-        problem: says how old the samples are that it acts on (`Problem.age`).
-    """
+    """Return a policy about true states as one about what the robot sees of them, `Problem.age`."""
     if not problem.age or policy.reference is None:
         return policy
     n, reference = len(policy.state_names), policy.reference.copy()
@@ -104,29 +94,12 @@ def for_late_samples(policy: Policy, problem: Problem) -> Policy:
 
 
 def each_stepped(model: Model, x: Array, u: Array, p: Array, dt: float) -> Array:
-    """Step the model for N rows that each have their own parameters.
-
-    Args:
-        model: of n states, m inputs and k parameters.
-        x: states (N, n).
-        u: inputs (N, m).
-        p: parameters (N, k).
-        dt: the control interval [s].
-
-    Returns:
-        The next states (N, n).
-    """
+    """Return the next states of rows x (N, n), u (N, m), each with its parameters p (N, k)."""
     return stepper(model, p, dt)(x, u)
 
 
 def stepper(model: Model, p: Array, dt: float) -> Callable[[Array, Array], Array]:
-    """Return the function (x, u) -> next states of `each_stepped`, to call it many times.
-
-    Args:
-        model: of n states, m inputs and k parameters.
-        p: parameters (N, k).
-        dt: the control interval [s].
-    """
+    """Return the function (x, u) -> next states of `each_stepped`, to call it many times."""
     together = getattr(model.step, "rows", None)  # simulators step all rows at once
     if together is not None:
         return lambda x, u: np.asarray(together(x, u, p, dt))
@@ -156,11 +129,7 @@ def equal_rows(table: Array) -> list[tuple[Any, Array]]:
 def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Array:
     """Return z_0 .. z_T (T + 1, nz) of a recorded run: each state with the inputs sent before it.
 
-    Args:
-        problem: has the number of past inputs in z.
-        states: (T + 1, n).
-        inputs: commands (T, m).
-        past: the input held before t = 0, (m,).
+    From states (T + 1, n), commands (T, m), and the input held before them (m,).
     """
     columns = [states]
     for j, depth in enumerate(problem.depths):
@@ -173,13 +142,7 @@ def augmented(problem: Problem, states: Array, inputs: Array, past: Array) -> Ar
 
 
 def apart(problem: Problem, a: Run, b: Run) -> float:
-    """Return the cost of the difference of two runs, over the states that both have.
-
-    Args:
-        problem: has the weights.
-        a: states (H + 1, n) and inputs (H, m).
-        b: the other run.
-    """
+    """Return the cost of the difference of two runs, over the states that both have."""
     n = min(a[0].shape[1], b[0].shape[1])
     with np.errstate(all="ignore"):
         x = wrapped(a[0][:, :n] - b[0][:, :n], problem.angles[:n]) ** 2

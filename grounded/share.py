@@ -28,16 +28,7 @@ class Share:
 
 
 def share_of(trials: Sequence[Trial], steps: int = STEPS, most: int = TRIALS) -> Share:
-    """Choose trials within a budget of steps and of trials.
-
-    Args:
-        trials: in the order in which they were recorded.
-        steps: the budget, of all trials together.
-        most: the largest number of trials.
-
-    Returns:
-        The trials themselves if they are within it.
-    """
+    """Choose trials, which are in the order of their recording, within both budgets."""
     total = sum(trial.steps for trial in trials)
     if total <= steps and len(trials) <= most:
         return Share([*trials])

@@ -38,10 +38,10 @@ def suspicion(path: Path) -> Finding | None:
 
 
 def check_own(folder: Path, paths: Iterable[Path]) -> None:
-    """Refuse to execute code in a folder that another user may have changed.
+    """Refuse to execute code in a workspace's folder that another user may have changed.
 
     Args:
-        folder: a workspace.
+        folder: the workspace.
         paths: files that are executed or that name what is executed; missing files are skipped.
 
     Raises:

@@ -49,12 +49,7 @@ ENDINGS = {
 
 
 def factor_between(said: str, wanted: str) -> float | None:
-    """Return the factor that converts a number from one unit to another; None if incompatible.
-
-    Args:
-        said: the unit of the number, such as "mm/s" or "deg/s^2".
-        wanted: the unit that is wanted.
-    """
+    """Return the factor that converts a number from one unit to another; None if incompatible."""
     (a, one), (b, other) = _in_base(said), _in_base(wanted)
     return one / other if a == b else None
 

@@ -53,12 +53,8 @@ def step_rewards(
 ) -> Array:
     """Return the reward of every step, (H + 1,): negative penalties that sum to the utility.
 
-    Args:
-        reward: the weights.
-        error: s_t - target_t with angles wrapped, (H + 1, n); NaN where not tracked.
-        inputs: a_0 .. a_{H-1}, (H, m).
-        input_target: target of the inputs, (H, m); zero for the paper's penalty.
-        past: the input held before t = 0, (m,).
+    `error` is s_t - target_t with angles wrapped, (H + 1, n), NaN where not tracked; `past` (m,)
+    was held before the inputs (H, m), whose target the paper has at zero.
     """
     tracked = np.where(np.isnan(error) & (reward.state + reward.terminal == 0), 0.0, error)
     with np.errstate(over="ignore", invalid="ignore"):  # diverged runs: see `Task.utility`

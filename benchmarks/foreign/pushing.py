@@ -117,5 +117,5 @@ def setup(**what: float) -> tuple[Task, Robot, Task]:
 
     asked, xml = task(), PLANE.format(**{"mass": 0.5, "floor": 0.35, "tip": 0.4} | what)
     truth = mujoco.model(xml)
-    robot = Robot(MujocoRobot(xml, np.zeros(truth.n), columns=list(range(5))))
+    robot = Robot(MujocoRobot(xml, np.zeros(5), columns=list(range(5))))
     return asked, robot, with_true_model(asked, truth)

@@ -35,7 +35,6 @@ Slopes = Literal[
 DOUBTFUL_GAIN = 0.1
 IMPROVED = 0.95  # probability of an improvement from which it counts as one
 UNSTEADY = 0.5  # standard deviation of a candidate's runs, as a share of their cost
-UNLIKE = 0.2  # fraction of a predicted gain: a difference of the base's utility that matters
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,35 +89,16 @@ class Candidate(Result):
         """Whether the likely error is at least the predicted gain."""
         return 0 < self.likely_off >= self.predicted_gain
 
-    @property
-    def expected_of_base(self) -> float:
-        """The utility of the base candidate in the same model.
-
-        It excludes the effects of noise and of a different start state on the base's trials.
-        """
-        return self.predicted_utility - self.predicted_gain
-
-    def unlike(self, utility: float) -> bool:
-        """Return whether the base's utility in the model differs clearly from its real utility."""
-        return abs(self.expected_of_base - utility) > UNLIKE * abs(self.predicted_gain)
-
     def promised_over(self, best: Tried) -> float:
         """Return the predicted gain over the best so far; every report uses this number.
 
-        If the model's utility of the base differs clearly from the real one, this is the gain
-        within the model, unless that would exceed the largest possible gain (no utility is above
-        0). It is never more than what of the best one's cost is not sensor noise, of which a plan
-        that replays single runs seems to remove some.
+        For a step from it, that is the gain within the model. It is never more than what of the
+        best one's cost is not sensor noise, of which a plan that replays single runs seems to
+        remove some.
         """
-        gain, noise = self._gain_over(best), best.noise_cost
-        return min(gain, -best.utility - noise) if 0 < noise < -best.utility else gain
-
-    def _gain_over(self, best: Tried) -> float:
-        """Return the predicted gain over the best so far, noise included."""
-        own = best.candidate.id == self.base and self.predicted_gain <= -best.utility
-        if own and self.unlike(best.utility):
-            return self.predicted_gain
-        return self.predicted_utility - best.utility
+        own, most = best.candidate.id == self.base, -best.utility - best.noise_cost
+        gain = self.predicted_gain if own else self.predicted_utility - best.utility
+        return min(gain, most) if most > 0 else gain
 
     @property
     def of_corrected(self) -> bool:

@@ -116,15 +116,7 @@ class Corrected(System):
         return np.ascontiguousarray(x[:, : self.base.n])
 
     def _next(self, moved: Array, x: Array, u: Array, t: int | slice, angles: Flags) -> Array:
-        """Return the next [x, y, u before] (N, 2 n + m).
-
-        Args:
-            moved: the base's next states (N, n).
-            x: states (N, 2 n + m).
-            u: inputs (N, m).
-            t: index of the step, or all steps.
-            angles: (n,) which states are angles.
-        """
+        """Return the next [x, y, u before] (N, 2 n + m), the base's next states being `moved`."""
         n, m = self.base.n, self.m
         away = wrapped(x[:, :n] - self.x[t], angles)
         before = x[:, 2 * n : 2 * n + m] - self.before[t]
@@ -136,9 +128,7 @@ class Corrected(System):
 def runs(problems: Sequence[Problem], policies: Sequence[Policy]) -> list[Rollout]:
     """Return the predicted runs of policies, each in its problem, as `predicted` does one by one.
 
-    Args:
-        problems: alike except for their biases and the laws of their `Corrected` systems.
-        policies: as many, of one horizon, over the problems' z or fewer states.
+    The problems are alike except for their biases and the laws of their `Corrected` systems.
     """
     systems = [one.system for one in problems if isinstance(one.system, Corrected)]
     open_loop = any(policy.gain is None for policy in policies)

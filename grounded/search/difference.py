@@ -49,16 +49,24 @@ class Scatter:
     variance: float = math.nan
     freedom: float = 0.0
 
-    def error(self, runs: int) -> float:
-        """Return the standard error of the mean of `runs` runs."""
-        return math.sqrt(self.variance / runs)
+    def error(self, *runs: int) -> float:
+        """Return the standard error of a difference of means of so many runs each."""
+        return math.sqrt(self.variance * sum(1 / count for count in runs))
 
 
 class Repeats:
     """The candidates that were run repeatedly, with their costs and sums of squares."""
 
     def __init__(self, history: Iterable[Tried]) -> None:
-        rows = [_sums(t) for t in history if len(t.utilities) > 1 and math.isfinite(t.utility)]
+        rows = []
+        for one in history:
+            runs = len(one.utilities)
+            if runs < 2 or not math.isfinite(one.utility):
+                continue
+            differ = len(set(one.utilities)) > 1  # else exactly 0, which a rounded mean may miss
+            with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
+                total = float(np.var(one.utilities)) * runs if differ else 0.0
+            rows.append((one.utility, runs - 1.0, total))
         if any(total for *_, total in rows):  # then identical runs must be copies
             rows = [row for row in rows if row[2]]
         self.rows = np.array(rows).reshape(len(rows), 3)
@@ -70,15 +78,6 @@ class Repeats:
         some |= not squares.any()  # then no run scatters, at whatever utility
         nu, total = float(freedom[some].sum()), float(squares[some].sum())
         return Scatter(total / nu, nu) if nu and math.isfinite(total) else Scatter()
-
-
-def _sums(tried: Tried) -> tuple[float, float, float]:
-    """Return the utility, its degrees of freedom, and the sum of squares."""
-    total, runs = 0.0, len(tried.utilities)
-    if len(set(tried.utilities)) > 1:  # else exactly 0, which a rounded mean may miss
-        with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
-            total = float(np.var(tried.utilities)) * runs
-    return tried.utility, runs - 1.0, total
 
 
 # --- what a start state costs ---------------------------------------------------------------------
@@ -129,53 +128,30 @@ class Difference:
         """By how much the mean utility of `after` exceeds that of `before`, as measured."""
         return self.after.utility - self.before.utility
 
+    @cached_property
+    def scatter(self) -> Scatter:
+        """The scatter of runs like those of `after`; a poor policy before says little of them."""
+        if not (self.before.utilities and self.after.utilities):
+            return Scatter()
+        return (self.pool or Repeats(self.history)).near(self.after.utility)
+
     @property
     def known(self) -> bool:
         """Whether repeats tell the error."""
-        return self.freedom > 0
+        return self.scatter.freedom > 0
 
     @property
     def error(self) -> float:
         """Standard error of the gain; NaN if it is not known."""
-        return self._spread[0]
-
-    @property
-    def freedom(self) -> float:
-        """Degrees of freedom of the error; 0 if it is not known."""
-        return self._spread[1]
-
-    @cached_property
-    def _spread(self) -> tuple[float, float]:
-        """Standard error and degrees of freedom; of different estimates as in Welch (1947).
-
-        If no repeats are near the earlier candidate, the scatter of the later one is used for both.
-        """
-        pool, runs = self._pool, (len(self.before.utilities), len(self.after.utilities))
-        later, earlier = (pool.near(one.utility) for one in (self.after, self.before))
-        if not (later.freedom and all(runs)):
-            return math.nan, 0.0
-        earlier = earlier if earlier.freedom else later
-        squares = earlier.error(runs[0]) ** 2, later.error(runs[1]) ** 2
-        error = math.sqrt(sum(squares))
-        if earlier == later or not error:
-            return error, later.freedom
-        parts = squares[0] ** 2 / earlier.freedom + squares[1] ** 2 / later.freedom
-        return error, error**4 / parts
-
-    @cached_property
-    def _pool(self) -> Repeats:
-        return self.pool or Repeats(self.history)
+        return self.scatter.error(len(self.before.utilities), len(self.after.utilities))
 
     @property
     def likely_error(self) -> float:
-        """The standard error if `before` scatters as `after` does, since a poor policy says little.
-
-        While nothing was repeated, by half of the cost, as chi-squared with eight degrees of
-        freedom does.
-        """
-        near, cost = self._pool.near(self.after.utility), abs(self.after.utility)
-        runs = 1 / len(self.before.utilities) + 1 / len(self.after.utilities)
-        return math.sqrt(runs * near.variance) if near.freedom else 0.5 * cost * math.sqrt(runs)
+        """The same; while nothing was repeated, that of costs which scatter by half of them."""
+        if self.known:
+            return self.error
+        usual = Scatter((0.5 * self.after.utility) ** 2)
+        return usual.error(len(self.before.utilities), len(self.after.utilities))
 
     @cached_property
     def probability(self) -> float:
@@ -184,7 +160,8 @@ class Difference:
             return 1.0
         if not self.known:
             return math.nan
-        return student(self.gain / self.error, self.freedom) if self.error else float(self.gain > 0)
+        freedom = self.scatter.freedom
+        return student(self.gain / self.error, freedom) if self.error else float(self.gain > 0)
 
     @property
     def sure(self) -> bool:
@@ -235,8 +212,8 @@ def last_gain(history: Sequence[Tried]) -> Difference | None:
 
 def one_trial_error(best: Tried, repeats: int = 1) -> float:
     """Return the standard error of a new candidate's gain over the best; 0 if no noise is known."""
-    each = best.deviation
-    return each * math.sqrt(1 / repeats + 1 / len(best.utilities)) if each > 0 else 0.0
+    each = Scatter(best.deviation**2)
+    return each.error(repeats, len(best.utilities)) if best.deviation > 0 else 0.0
 
 
 def in_question(made: Candidate, best: Tried, repeats: int = 1) -> Finding | None:
@@ -305,7 +282,7 @@ def judged(
         utilities = tuple(task.utility(t) for t in own)
         gone = tuple(one for one in candidate.seen if one not in known)
         failed = any(u == -np.inf for u in utilities)
-        exact = exact or (agree and repeated_exactly(own))
+        exact = exact or (agree and any(one.repeats(other) for one, other in pairwise(own)))
         enough = min(options.repeats, len(own)) if exact and own else options.repeats
         if len(own) < enough and not failed:
             history.append(Tried(candidate, own, utilities, None, gone=gone))
@@ -357,11 +334,6 @@ def with_chance(tried: Tried, best: Tried | None, history: Sequence[Tried], pool
         return tried
     gained = Difference(best, tried, history, pool)
     return replace(tried, probability=gained.probability, unsure=not gained.sure)
-
-
-def repeated_exactly(trials: Sequence[Trial]) -> bool:
-    """Return whether two successive trials have exactly the same states."""
-    return any(a.repeats(b) for a, b in pairwise(trials))
 
 
 def in_doubt(incumbent: Tried, loser: Tried, history: Sequence[Tried], most: int) -> bool:

@@ -118,15 +118,9 @@ def _read_off_path(task: Task) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def trim(task: Task, x: Array, known: NDArray[np.bool_]) -> tuple[Array, Array]:
-    """Solve for the free states and the inputs along a nominal run.
+    """Return x (H, n) with free columns solved for, and u (H, m), along a nominal run.
 
-    Args:
-        task: the model, the limits and the input held before the start.
-        x: (H + 1, n), the prescribed columns; the others are a first guess.
-        known: (n,), which columns are prescribed.
-
-    Returns:
-        x (H, n) with the free columns filled in, u (H, m).
+    Columns of x (H + 1, n) that are not known (n,) are a first guess.
     """
     H, free = task.horizon, np.flatnonzero(~known)
     batch, simulated = _steps(task, x, known), task.model.system.simulated

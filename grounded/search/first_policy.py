@@ -149,13 +149,13 @@ def finished(
     most: int = ITERATIONS,
     tick: Tick | None = None,
 ) -> ddp.Solution:
-    """Run DDP to convergence, in pieces short enough for Ctrl-C.
+    """Run DDP from inputs (H, m) to convergence, in pieces short enough for Ctrl-C.
 
     Args:
         problem: what to solve.
-        inputs: (H, m) initial inputs.
-        K: (H, m, nz) feedback of the first rollout, about `z`.
-        z: (H, nz), see `K`.
+        inputs: initial inputs.
+        K: (H, m, nz) feedback of the first rollout, about z (H, nz).
+        z: see K.
         most: most iterations.
         tick: called with a line of progress after each piece, of a simulator each iteration.
     """

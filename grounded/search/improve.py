@@ -116,7 +116,7 @@ def propose(
     if not plan.ok:
         raise refused("plan.none", why=plan.sentence)
     model = planner.plan.problem(exact=True)
-    made = make.checked(make.with_margin(make.candidate(policy, model, Step()), model))
+    made = make.checked(make.candidate(policy, model, Step()))
     if plan.status == "converged":
         return made
     return replace(made, findings=(*made.findings, found("plan.not_optimal", why=plan.sentence)))

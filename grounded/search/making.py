@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 from grounded.search.corrected import Corrected
-from grounded.search.feedback import between_limits, limit_cycle, planned_age, steadied
+from grounded.search.feedback import between_limits, limit_cycle, planned_age
 from grounded.search.mispredictions import Believed, believed, believed_by_step
 from grounded.search.noise import beyond_noise
 from grounded.search.planner import Planner, predicted
@@ -31,7 +31,6 @@ PLANNING = DescentOptions(max_iterations=30, tolerance=1e-6)  # precise enough f
 GENTLER = 1e3  # factor on the input weights for each unit of caution
 GAIN_SHARE, CAUTION_PARTS = 0.5, 12  # of the mean gain to fall below; parts of a unit of caution
 FELL = 10.0  # cost, relative to the run that swung, above which gentler feedback is too weak
-SAME_STEP = 0.2  # relative distance to a run that lost within which a step counts as the same
 
 
 def begun_at(task: Task, trials: Sequence[Trial], predicted: Array) -> Trial:
@@ -116,18 +115,14 @@ class About:
         """Return the first step worth a trial, else one that is not allowed, else None.
 
         A step whose likely error exceeds its gain is only used if there is no other, and none that
-        may lose more than the best one costs. Steps whose run is nearly that of a candidate that
-        lost are skipped: if the damping penalty is small beside the other weights, ten times the
-        damping gives the same step.
+        may lose more than the best one costs.
 
         Args:
             first: the due step, regardless of the derivatives of those that lost.
         """
         make, options = self.make, self.options
-        history, model = make.now.history, make.fingerprint
-        first = options.due(history, self.incumbent, model, self.way, self.slopes) or first
-        lost = losers_of(history, self.incumbent.candidate.id, model)
-        foretold = [predicted(self.real, candidate.policy) for candidate in lost]
+        known = (make.now.history, self.incumbent, make.fingerprint)
+        first = options.due(*known, self.way, self.slopes) or first
         unsafe: Proposal | None = None
         doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
@@ -145,10 +140,8 @@ class About:
                 directions[step.damping] = for_late_samples(found, self.real)
             policy = self.theta.toward(directions[step.damping], step.alpha)
             made = self.candidate(policy, step, self.way)
-            if any(self._near(made, run) for run in foretold):
-                continue
             if made.predicted_gain > self.least:
-                proposal = make.checked(make.with_margin(made, self.real))
+                proposal = make.checked(made)
                 if proposal.candidate is None:
                     unsafe = proposal
                     continue
@@ -163,11 +156,6 @@ class About:
             if abs(made.predicted_gain) <= self.least:
                 break
         return doubted or unsafe
-
-    def _near(self, made: Candidate, lost: Rollout) -> bool:
-        """Return whether a candidate's run is nearly that of one that lost, in this model."""
-        run, other = (made.predicted_states, made.predicted_inputs), (lost.states, lost.inputs)
-        return apart(self.real, run, other) <= SAME_STEP**2 * apart(self.real, self.run, other)
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """Return the changed model's own plan if its predicted gain exceeds the rival's.
@@ -190,7 +178,7 @@ class About:
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
         if not (swung or made.expected_gain > max(promise, self.least)):
             return None
-        proposal = make.checked(make.with_margin(made, self.real))
+        proposal = make.checked(made)
         return proposal if proposal.candidate is not None else None
 
 
@@ -220,7 +208,8 @@ class Maker:
             caution = max(caution, self.gentled)
         if caution and base is not None:
             policy = self._gently(policy, problem, predicted(problem, policy), caution)
-        made = Candidate(
+        run, task = predicted(problem, policy), self.planner.task
+        return Candidate(
             id=self.identity,
             policy=policy,
             iteration=0 if base is None else self.now.iteration + 1,
@@ -228,29 +217,15 @@ class Maker:
             damping=step.damping,
             base="" if base is None else base.candidate.id,
             model=self.fingerprint,
-            predicted_states=policy.feedforward,
-            predicted_inputs=policy.feedforward,
-            predicted_utility=already,
+            predicted_states=run.states[:, : task.model.n],
+            predicted_inputs=run.inputs,
+            predicted_utility=run.utility,
+            predicted_gain=run.utility - already,
+            sample_age=problem.age,
             caution=caution,
             way=way,
             seen=tuple(one.id for tried in self.now.history for one in tried.trials if one.id),
-            units={**self.planner.task.model.states, **self.planner.task.model.inputs},
-        )
-        return self.foretold(made, policy, problem, already)
-
-    def foretold(
-        self, made: Candidate, policy: Policy, problem: Problem, already: float
-    ) -> Candidate:
-        """Return the candidate with another policy and the model's prediction for it."""
-        run = predicted(problem, policy)
-        return replace(
-            made,
-            policy=policy,
-            predicted_gain=run.utility - already,
-            sample_age=problem.age,
-            predicted_states=run.states[:, : self.planner.task.model.n],
-            predicted_inputs=run.inputs,
-            predicted_utility=run.utility,
+            units={**task.model.states, **task.model.inputs},
         )
 
     def gentler(self, incumbent: Tried) -> Candidate | None:
@@ -293,14 +268,7 @@ class Maker:
         return max(kept, default=0.0)
 
     def _gently(self, policy: Policy, problem: Problem, run: Rollout, caution: float) -> Policy:
-        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight.
-
-        Args:
-            policy: a policy.
-            problem: predicts its run.
-            run: that run.
-            caution: see above.
-        """
+        """Return the same run with the gains of an LQR with GENTLER ** caution the input weight."""
         if policy.gain is None:
             return policy
         gentle = self.planner.dearer(problem, GENTLER**caution)
@@ -308,19 +276,10 @@ class Maker:
         if not (found.ok and np.isfinite(run.z).all()):
             return policy
         plan, columns = self.planner.plan, base_columns(problem, self.planner.plan)
-        n, units = self.planner.task.model.n, plan.model.states
-        K = measured_gains(gentle, run.z, run.inputs, found.gains.K, n, units)
+        n = self.planner.task.model.n
+        K = measured_gains(gentle, run.z, run.inputs, found.gains.K, n)
         made = plan.policy(run.inputs, K[:, :, columns], run.z[:-1, columns])
         return self.planner.narrowed(for_late_samples(made, problem))
-
-    def with_margin(self, made: Candidate, problem: Problem) -> Candidate:
-        """Return the same run with gains that hold under worse conditions."""
-        own = made.policy
-        if own.gain is None or not self.planner.needs_margin:
-            return made
-        run, loose = predicted(problem, own), self.planner.loosened(problem)
-        new = steadied(problem, own, run, partial(self._gently, own, problem, run), loose)
-        return made if new is own else self.foretold(made, new, problem, made.expected_of_base)
 
     @cached_property
     def age(self) -> float:
@@ -360,8 +319,7 @@ def direction(
         corrected: the model with derivatives corrected by trials; None for the original model.
         measured: number of leading states that the robot measures; None for all of the task's.
             Gains on the memory of an adopted effect are replaced by gains on those
-            (`measured_gains`). Gains on the memory of a corrected model are dropped
-            (`feedback.steadied` checks the effect).
+            (`measured_gains`). Gains on the memory of a corrected model are dropped.
     """
     if options.method == "policy-gradient":
         from grounded.solve.policy_gradient import ascent
@@ -377,7 +335,7 @@ def direction(
     found = ddp.solve(problem, grounding.inputs, gains.K, z[:-1], PLANNING)
     K = found.K
     if measured is not None and measured < task.model.n:
-        K = measured_gains(problem, found.z, found.u, K, measured, task.model.states)
+        K = measured_gains(problem, found.z, found.u, K, measured)
     columns = base_columns(problem, task)
     return task.policy(found.u, K[:, :, columns], found.z[:-1, columns])
 

@@ -97,14 +97,7 @@ def believed(
     history: Sequence[Tried],
     grounded: Problem,
 ) -> Believed:
-    """Return the grounded model, with corrected derivatives if they predict trials better.
-
-    Args:
-        planner: the task, and the task used for planning.
-        incumbent: the candidate whose trial the model replays.
-        history: all candidates with their trials.
-        grounded: the exact model with the incumbent's bias.
-    """
+    """Return the exact grounded model, with derivatives corrected if those predict better."""
     known = neighbours(planner, incumbent, history, grounded)
     if known is None:
         return Believed(grounded)
@@ -155,10 +148,7 @@ def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:
 def unforetold(models: Sequence[Problem], own: Seen, others: Sequence[Seen]) -> list[float]:
     """Return the share of each trial's difference from the incumbent's that its model mispredicts.
 
-    Args:
-        models: one for each of the other trials, alike except for their laws.
-        own: the incumbent's trial.
-        others: other trials.
+    There is one model for each of the other trials; they are alike except for their laws.
     """
     found = runs(models, [other.policy for other in others])
     return [
@@ -195,11 +185,6 @@ def received(problem: Problem, u: Array) -> Array:
 def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | None, float]:
     """Fit laws 1 and 2, the error of the derivatives with respect to [x, u, u before, y before].
 
-    Args:
-        own: the incumbent's trial.
-        others: other trials.
-        grounded: the exact model with the incumbent's bias.
-
     Returns:
         The sum of the laws (H, n, 2 n + 2 m), or None if no trial differs from the incumbent's; and
         the share of the mispredictions that law 1 leaves in held-out parts of the run.
@@ -223,9 +208,8 @@ def laws(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array | 
 def moved_near(own: Seen, others: Sequence[Seen], grounded: Problem) -> tuple[Array, Array, Array]:
     """Return what the nearest trials (j) that differ from the incumbent's show of the derivatives.
 
-    Returns:
-        Their differences in [x, u, u before, y before] (j, H, 2 n + 2 m), mispredictions (j, H, n),
-        and distances (j,), the nearest first.
+    These are their differences in [x, u, u before, y before] (j, H, 2 n + 2 m), mispredictions
+    (j, H, n) and distances (j,), the nearest first.
     """
     span = input_span(grounded, own.u)
     reach = np.ptp(own.x, axis=0) + 1e-9
@@ -260,12 +244,9 @@ def _matching(own: Seen, y: Array, grounded: Problem, span: Array) -> tuple[Arra
 
 
 def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
-    """Fit the law y_t = C d_t, constant over the run, by ridge regression.
+    """Fit the law y_t = C d_t, constant over the run, to trials by ridge regression.
 
-    Args:
-        d: features of trials (j, H, q).
-        y: mispredictions to explain (j, H, k).
-        far: (j,) distance of each trial from the incumbent.
+    d are features (j, H, q), y mispredictions (j, H, k), far distances from the incumbent (j,).
 
     Returns:
         C (k, q), and the share of y that it leaves in held-out parts of the run; zeros and 1 if no
@@ -300,17 +281,10 @@ def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
 def believed_by_step(
     planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
 ) -> Believed | None:
-    """Return the grounded model with derivatives corrected step by step.
+    """Return the exact grounded model with derivatives corrected step by step.
 
-    Args:
-        planner: the task, and the task used for planning.
-        incumbent: the candidate whose trial the model replays.
-        history: all candidates with their trials.
-        grounded: the exact model with the incumbent's bias.
-
-    Returns:
-        The model and the share of movements that it mispredicts. None if fewer than two other
-        trials are known, or if it does not predict those that are left out.
+    None if fewer than two other trials are known, or if it does not predict those that are left
+    out.
     """
     known = neighbours(planner, incumbent, history, grounded)
     if known is None or len(known[1]) < 2:
@@ -326,13 +300,7 @@ def believed_by_step(
 
 
 def laws_by_step(others: Sequence[Seen], own: Seen, grounded: Problem) -> Array:
-    """Return the laws of the whole run plus those of each step, (H, n, 2 n + 2 m).
-
-    Args:
-        others: other trials, of which at least one differs.
-        own: the incumbent's trial.
-        grounded: the exact model with the incumbent's bias.
-    """
+    """Return the laws of the whole run plus those of each step, (H, n, 2 n + 2 m)."""
     d, y, far = moved_near(own, others, grounded)
     made, _ = laws(own, others, grounded)
     if made is None:

@@ -28,11 +28,7 @@ SAME_START = 1e-9  # difference treated as zero, in the state's unit or relative
 def beyond_noise(trials: Sequence[Trial], off: Array, start: Array, predicted: Array) -> Array:
     """Return which start states differ from s_0 by more than the sensor noise, (n,) bool.
 
-    Args:
-        trials: N trials of one candidate.
-        off: first state of each trial less s_0, (N, n).
-        start: s_0 of the task (n,).
-        predicted: their candidate's predicted states (H+1, n).
+    `off` (N, n) is the first state of each trial of a candidate less s_0, its `start` (n,).
     """
     each = [sample_noise(trial, predicted) ** 2 for trial in trials]
     noise = np.sqrt(np.mean(each, axis=0) / len(trials))
@@ -46,10 +42,6 @@ def sample_noise(trial: Trial, predicted: Array) -> Array:
     The noise of a filtered speed changes little from sample to sample, so that second differences
     of neighbours don't show it. Those over SLOW_S show it, of what differs from the prediction, as
     the motion bends, too. They are bounded, since an error of the model bends as well.
-
-    Args:
-        trial: a run of a candidate.
-        predicted: its predicted states (H+1, n).
     """
     white, lag = trial.noise(), max(1, round(SLOW_S / trial.dt))
     T = min(len(predicted), trial.finite_steps + 1)
@@ -74,12 +66,8 @@ def noise_cost(task: Task, policy: Policy, noise: Array) -> float:
     """Return the mean loss of utility of a logged run due to sensor noise; >= 0.
 
     It counts the noise of weighted states and the inputs that the gains derive from it. The motion
-    that these inputs cause is neglected: robots are slow compared with white noise.
-
-    Args:
-        task: its reward judges the log.
-        policy: the policy that is run.
-        noise: standard deviations of the sensors' white noise, (n,), in the states' units.
+    that these inputs cause is neglected: robots are slow compared with white noise. `noise` (n,)
+    are standard deviations in the states' units.
     """
     reward, steps = task.reward, task.horizon
     cost = float(noise**2 @ ((steps + 1) * reward.state + reward.terminal))
@@ -95,11 +83,6 @@ def noise_missed(task: Task, made: Candidate, noise: Array) -> float:
 
     All of it, if the model that predicted it replays no trial. Otherwise its bias contains the
     noise of the trial that it replays, and the predicted run shows it.
-
-    Args:
-        task: its reward judges the log.
-        made: the candidate.
-        noise: standard deviations of the sensors' white noise, (n,), in the states' units.
     """
     whole = noise_cost(task, made.policy, noise)
     return max(0.0 if made.grounded else whole, whole + made.predicted_utility)

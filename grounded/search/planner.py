@@ -60,24 +60,9 @@ class Planner:
         """Fingerprint of the planning model, see `model_fingerprint`."""
         return model_fingerprint(self.plan)
 
-    @property
-    def needs_margin(self) -> bool:
-        """Whether gains need a check of their margin: with memory, a delay or dry friction."""
-        assert self.plan.latency is not None
-        remembers = self.plan.model.n > self.task.model.n
-        return remembers or bool(self.plan.latency.any() or self.widths)
-
-    def loosened(self, problem: Problem) -> Problem | None:
-        """Return the problem without play, and with dry friction that builds up slowly.
-
-        None if it has neither.
-        """
-        kinked = self.widths or self.plays
-        return dataclasses.replace(problem, p=self.loose.model.values) if kinked else None
-
     def dearer(self, problem: Problem, factor: float) -> Problem:
-        """Return the problem, loosened, with `factor` the input weights."""
-        easier = self.loosened(problem) or problem
+        """Return the problem, `loose`, with `factor` the input weights."""
+        easier = dataclasses.replace(problem, p=self.loose.model.values)
         weight = factor * easier.input_weight + (factor - 1) * easier.change_weight
         return dataclasses.replace(easier, input_weight=weight)
 
@@ -161,7 +146,7 @@ class Planner:
         if self.widths:
             problem = self.dearer(task.problem(exact=True), 1.0)
             K = sweep(problem, found.z, found.u).gains.K
-        K = measured_gains(problem, found.z, found.u, K, n, task.model.states)
+        K = measured_gains(problem, found.z, found.u, K, n)
         return dataclasses.replace(policy, gain=K), found
 
     def with_model(self, model: Model) -> Planner:
@@ -278,13 +263,7 @@ def _input(task: Task, name: str, target: str) -> int:
 
 
 def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
-    """Return a planner with another model and latency.
-
-    Args:
-        task: judges the trials.
-        model: the planning model, whose first states are the task's.
-        latency: transport delay of each input [s] (m,).
-    """
+    """Return a planner with a model whose first states are the task's, and a latency [s] (m,)."""
     extra = model.n - task.model.n
     held = Trial(
         states=task.start[None],

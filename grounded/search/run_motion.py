@@ -20,10 +20,7 @@ LEFT_BY_FLIP = 0.3  # share left of one state's error if the sign of an input is
 def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding | None:
     """Return the input that acted the other way round in a trial, or None.
 
-    Args:
-        planner: plans with the model, and the effects adopted.
-        trial: a trial; only its part without gaps is used.
-        astray: it is a run far from its prediction, where predictions with the flipped sign tell.
+    Of a run far from its prediction, `astray`, predictions with the flipped sign tell as well.
     """
     acts = _acts(planner, trial)
     wrong = {name: one for name, one in acts.items() if one.sign < 0}
@@ -52,12 +49,7 @@ def reversed_input(planner: Planner, trial: Trial, *, astray: bool) -> Finding |
 
 
 def signs_of(planner: Planner, trial: Trial) -> dict[str, int]:
-    """Return the sign with which each input acts: 1 as in the model, -1 reversed, 0 unknown.
-
-    Args:
-        planner: plans with the model, and the effects adopted.
-        trial: a trial; only its part without gaps is used.
-    """
+    """Return the sign with which each input acts: 1 as in the model, -1 reversed, 0 unknown."""
     return {name: one.sign for name, one in _acts(planner, trial).items()}
 
 

@@ -59,13 +59,7 @@ def spread(task: Task, history: Sequence[Tried], model: str) -> Array:
 def objections(
     task: Task, candidate: Candidate, strays: Array | None = None
 ) -> tuple[Finding, ...]:
-    """Return the reasons why a candidate must not be run; empty if there are none.
-
-    Args:
-        task: has the limits of [safety].
-        candidate: the candidate with its predicted run.
-        strays: deviations of real runs so far, see `spread`; None for zero.
-    """
+    """Return the reasons why a candidate must not be run; `strays` as `spread` gives them."""
     policy, name = candidate.policy, candidate.id
     parts = {"feed-forward": policy.feedforward, "predicted state": candidate.predicted_states}
     if policy.gain is not None and policy.reference is not None:
@@ -128,12 +122,7 @@ def _outside(task: Task, candidate: Candidate, strays: Array | None, i: int) -> 
 
 
 def coasting(task: Task, run: Trial, held: Array) -> Array:
-    """Simulate the robot after a run, with the input that its runner sends then.
-
-    Args:
-        task: the planning task, whose model includes memory states.
-        run: the run, with that task's states (T + 1, n).
-        held: the input that is sent after it (m,).
+    """Simulate the planning task's robot after a run, while its runner sends `held` (m,).
 
     Returns:
         States (S + 1, n) from the end of the run on, up to the first non-finite one.
@@ -154,14 +143,7 @@ def coasting(task: Task, run: Trial, held: Array) -> Array:
 
 
 def coasts_out(task: Task, plan: Task, run: Trial, held: Array) -> Finding | None:
-    """Return that the model predicts that the robot leaves [safety] after a run, or None.
-
-    Args:
-        task: has the limits of [safety].
-        plan: the planning task, see `coasting`.
-        run: the predicted run, inside [safety].
-        held: the input that is sent after it (m,).
-    """
+    """Return that by the plan's model the robot leaves the task's [safety] after a run, or None."""
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([task.safety_low, task.safety_high]).any():
         return None

@@ -23,9 +23,7 @@ grounded model, whereas a halved step mixes two policies and is not planned as s
 `[search] step = "full"` alpha is halved from the start, as in the paper.
 
 This applies among steps with the same derivatives: losses with the crude model's derivatives do not
-count against steps with corrected ones (`mispredictions`). If the damping penalty is small beside
-the other weights, ten times the damping gives nearly the same step; a step that the model runs
-nearly as one that lost is skipped.
+count against steps with corrected ones (`mispredictions`).
 
 Real trials are the evaluations of this line search, so it is not a loop but a function of the
 trials so far. A step is also skipped if its predicted run leaves the safe region.
@@ -83,10 +81,7 @@ def after_success(step: Step, predicted: float, real: float) -> Step:
 def after_failure(step: Step, max_halvings: int, *, damps: bool = True) -> Step | None:
     """Return the next, more cautious step; None if the line search has failed (step 7).
 
-    Args:
-        step: the step that did not improve the utility.
-        max_halvings: smallest alpha is 2^-max_halvings.
-        damps: whether the damping is raised before alpha is halved.
+    The smallest alpha is 2^-max_halvings; `damps`: the damping is raised before alpha is halved.
     """
     if damps and step.damping < LARGEST_DAMPING:
         return replace(step, damping=min(step.damping * RAISED, LARGEST_DAMPING))
@@ -195,14 +190,7 @@ class SearchOptions:
 def losers_of(
     history: Sequence[Tried], base: str, model: str, way: Way | None = None
 ) -> list[Candidate]:
-    """Return the candidates derived from `base` in this model that did not improve on it.
-
-    Args:
-        history: all candidates with their trials.
-        base: id of the candidate that they started from.
-        model: fingerprint of the model.
-        way: only candidates made in this way; None for all.
-    """
+    """Return those made from `base` in this model, in this way if any, that did not improve."""
     tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
     lost = [t.candidate for t in tried if t.lost]
     return [c for c in lost if way is None or c.way == way]

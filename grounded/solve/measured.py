@@ -20,9 +20,6 @@ large, state by state, as what the run itself does in a step.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from types import MappingProxyType
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,21 +28,13 @@ from grounded.compile.run.interpreted import Quadratic, diagonals, linearised
 from grounded.frozen import Array, wrapped
 
 PASSES = 4
-SHARES = (0.5, 0.25, 0.0)  # of the gains on the known part: what is left where no pass is better
 SAME = 1e-9  # of what inputs do together: less, in difference, is rounding
 UNMOVED = 1e-3  # of what a state or input does along the run
 RIDGE = 1e-6  # of a known quantity's own variance
 
 
-def measured_gains(
-    problem: Problem,
-    z: Array,
-    u: Array,
-    K: Array,
-    measured: int,
-    units: Mapping[str, str] = MappingProxyType({}),
-) -> Array:
-    """Gains (H, m, nz) that are zero on states that are not measured.
+def measured_gains(problem: Problem, z: Array, u: Array, K: Array, measured: int) -> Array:
+    """Return gains (H, m, nz) that are zero on states that the robot does not measure.
 
     Args:
         problem: whose optimum the run is.
@@ -53,8 +42,6 @@ def measured_gains(
         u: its inputs (H, m).
         K: gains on all of z (H, m, nz); an input without any at some step keeps none there.
         measured: how many of the first states the robot measures; it knows the inputs it sent.
-        units: of states, by name: what hardly moves along the run is disturbed by UNMOVED of
-            what the others of its unit are: a robot that drives straight never leaves its line.
     """
     known = np.ones(problem.nz, bool)
     known[measured : problem.system.n] = False
@@ -63,24 +50,13 @@ def measured_gains(
         return dropped
     with np.errstate(all="ignore"):
         q = linearised(problem.system, problem, z, u)
-        noise, still = _disturbances(problem, z, units), UNMOVED * np.ptp(z, axis=0)
-        tried, gains = [dropped, *(share * dropped for share in SHARES)], K
+        noise = np.mean(wrapped(np.diff(z, axis=0), problem.angles) ** 2, axis=0)
+        noise[problem.system.n :] = 0.0  # inputs sent are not disturbed
+        tried, gains, still = [dropped], K, UNMOVED * np.ptp(z, axis=0)
         for _ in range(PASSES):
             gains = _swept(q, K, _estimates(q, gains, noise, known, still), known)
             tried.append(gains)
         return tried[int(np.argmin(_costs(q, np.array(tried), noise)))]
-
-
-def _disturbances(problem: Problem, z: Array, units: Mapping[str, str]) -> Array:
-    """Variance of what each column of z is disturbed by in a step (nz,); none of inputs sent."""
-    moved = wrapped(np.diff(z, axis=0), problem.angles)
-    variance: Array = np.mean(moved**2, axis=0)
-    variance[problem.system.n :] = 0.0
-    own = np.array([units.get(name, "") for name in problem.system.states])
-    for unit in {*own} - {""}:
-        alike = np.flatnonzero(own == unit)
-        variance[alike] = np.maximum(variance[alike], UNMOVED**2 * variance[alike].max())
-    return variance
 
 
 def _estimates(
@@ -126,7 +102,7 @@ def _swept(q: Quadratic, K: Array, estimates: Array, known: NDArray[np.bool_]) -
             if not free.all():
                 Q_uu, Q_uz = Q_uu[np.ix_(free, free)], Q_uz[free]
             gains[t, free] = np.where(known, -_least_squares(Q_uu, Q_uz) @ estimates[t], 0.0)
-        V = _before(A + B @ gains[t], (*_by_inputs(q, gains[t]), weights[t]), V)
+        V = _before(A + B @ gains[t], _by_inputs(q, gains[t]) + weights[t], V)
     return gains
 
 
@@ -139,34 +115,26 @@ def _least_squares(Q_uu: Array, Q_uz: Array) -> Array:
 
 def _costs(q: Quadratic, K: Array, noise: Array) -> Array:
     """What the disturbances cost in the loops of gains K (P, H, m, nz), (P,)."""
-    loops, by_inputs, weights = q.A + q.B @ K, _by_inputs(q, K), diagonals(q.l_zz)
+    loops, own, weights = q.A + q.B @ K, _by_inputs(q, K), diagonals(q.l_zz)
     V = np.broadcast_to(weights[-1], loops[:, 0].shape)
     total = V.diagonal(axis1=1, axis2=2) @ noise
     for t in range(K.shape[1] - 1, -1, -1):
-        V = _before(loops[:, t], (*(part[:, t] for part in by_inputs), weights[t]), V)
+        V = _before(loops[:, t], own[:, t] + weights[t], V)
         total = total + V.diagonal(axis1=1, axis2=2) @ noise
     return np.where(np.isfinite(total), total, np.inf)
 
 
-def _by_inputs(q: Quadratic, K: Array) -> tuple[Array, Array, Array]:
-    """The parts (..., nz, nz) of the cost of steps that inputs by gains K (..., m, nz) cause."""
-    back = K.swapaxes(-1, -2)
-    cross = back @ q.l_uz
-    return back @ (q.l_uu[:, None] * K), cross, cross.swapaxes(-1, -2)
+def _by_inputs(q: Quadratic, K: Array) -> Array:
+    """The cost (..., nz, nz) of steps that inputs by gains K (..., m, nz) cause."""
+    cross = K.swapaxes(-1, -2) @ q.l_uz
+    return np.asarray(K.swapaxes(-1, -2) @ (q.l_uu[:, None] * K) + cross + cross.swapaxes(-1, -2))
 
 
-def _before(loop: Array, own: Sequence[Array], V: Array) -> Array:
-    """The value (..., nz, nz) of steps, with V after them.
+def _before(loop: Array, own: Array, V: Array) -> Array:
+    """The value (..., nz, nz) of steps of a loop A + B K and their own cost, with V after them.
 
     A sum of squares (Joseph's form) and symmetric to the last bit: in the shorter Q_zz + K'Q_uz +
     ..., what rounding leaves of asymmetry grows by K'B' each step, up to a negative cost.
-
-    Args:
-        loop: A + B K.
-        own: the parts of the steps' own cost.
-        V: the value after them.
     """
-    value = loop.swapaxes(-1, -2) @ V @ loop
-    for part in own:
-        value = value + part
+    value = loop.swapaxes(-1, -2) @ V @ loop + own
     return np.asarray(0.5 * (value + value.swapaxes(-1, -2)))

@@ -14,11 +14,11 @@ from grounded.policy import Policy, z_difference
 from grounded.rollout import for_late_samples, simulate
 from grounded.search import making
 from grounded.search.ask_tell import Search
-from grounded.search.feedback import sample_age, worse_costs
+from grounded.search.feedback import sample_age
 from grounded.search.first_guess import filled_target
 from grounded.search.first_policy import first_policy
 from grounded.search.improve import SearchOptions, propose
-from grounded.search.planner import Planner, planner_with, predicted
+from grounded.search.planner import Planner, planner_with
 from grounded.search.standing import standing
 from grounded.solve import ddp
 from grounded.trial import Trial
@@ -68,16 +68,6 @@ def made_by(planner: Planner) -> Policy:
     return made.policy
 
 
-def test_gains_that_rely_on_fresh_samples_are_made_gentler():
-    planner = joint([("delay:tau", {"d": 0.0148})], change=1e-7)
-    problem = planner.plan.problem(exact=True)
-    own, made = planner.narrowed(planner.first_policy()[0]), made_by(planner)
-    assert worse_costs([problem], own).max() > 20 * worse_costs([problem], made).max()
-    assert np.abs(made.gain).mean() < 0.7 * np.abs(own.gain).mean()
-    runs = [predicted(problem, policy).utility for policy in (own, made)]
-    assert runs[0] == pytest.approx(runs[1], rel=1e-6)  # the run itself stays
-
-
 def test_gains_do_not_count_on_a_joint_that_sticks():
     """Without gains at standstill, an arm with dry friction spins once it slips."""
     effects = [
@@ -85,12 +75,7 @@ def test_gains_do_not_count_on_a_joint_that_sticks():
         ("joint_friction:tau<-w", {"c": 0.3, "b": 0.02, "width": 0.005}),
     ]
     planner = joint([(name, {**values}) for name, values in effects], change=1e-6)
-    problem = planner.plan.problem(exact=True)
-    loose = planner.loosened(problem)
-    assert loose is not None and (loose.p > 10 * problem.p).sum() == 1
-    own, made = planner.narrowed(planner.first_policy()[0]), made_by(planner)
-    its, mine = (worse_costs([problem, loose], policy) for policy in (own, made))
-    assert np.log(mine).mean() <= np.log(its).mean() + 1e-9
+    made = made_by(planner)
     assert np.abs(made.gain[60:80, 0, 0]).min() > 0.1  # while it is to stand still
 
 
@@ -174,7 +159,9 @@ def test_a_model_that_replays_a_trial_replays_it_with_its_policy_on_old_samples(
     second = propose(task, [made], [trial], SearchOptions()).candidate
     assert second.sample_age == pytest.approx(AGE, abs=0.002)
     # what the model gives the first policy is what it had on the robot
-    assert second.expected_of_base == pytest.approx(task.utility(trial), rel=0.02)
+    assert second.predicted_utility - second.predicted_gain == pytest.approx(
+        task.utility(trial), rel=0.02
+    )
 
 
 def test_a_policy_for_late_samples_runs_as_planned():

@@ -183,7 +183,7 @@ def test_the_probability_is_the_t_tests():
     assert Difference(*history, history).probability == pytest.approx(
         1 - ttest_ind(a, b, alternative="less").pvalue
     )
-    assert Difference(*history, history).freedom == 4
+    assert Difference(*history, history).scatter.freedom == 4
 
 
 def test_more_repeats_of_each_candidate_show_smaller_gains():

@@ -40,8 +40,7 @@ PLAN: dict[str, Entry] = {
         "utility {utility}[[, about {log} in its log]][[, {noise} of it by sensor noise]]"
     ),
     "so_far": note(
-        "{utility} by {best}[[, {noise} of it by sensor noise]][[; for {best} itself the model "
-        "predicts {model}, of which {candidate} is to gain {gain}]]",
+        "{utility} by {best}[[, {noise} of it by sensor noise]]",
     ),
     "tested": note(
         "the last predictions missed the utility by {missed}[[; {failed:run} failed]][[; this one "

@@ -108,12 +108,8 @@ def promises(
     if best is not None:
         own = best.candidate.id
         noise = much_noise(best.noise_cost, best.utility)
-        said = found("plan.so_far", own, best=own, utility=best.utility, noise=noise)
-        if made.base == own and made.unlike(best.utility):
-            # the gain of the candidate is counted from what the model gives the best one
-            gain, of_base = made.predicted_gain, made.expected_of_base
-            said = said.also(candidate=made.id, model=of_base, gain=gain)
-        told["so far"] = said
+        so_far = found("plan.so_far", own, best=own, utility=best.utility, noise=noise)
+        told["so far"] = so_far
     return told | {"trust": _trust(workspace, made, now)}
 
 
