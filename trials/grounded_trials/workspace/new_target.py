@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+import re
+import tomllib
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from pathlib import Path
@@ -19,7 +22,7 @@ from grounded_trials.plain_file import unreadable
 from grounded_trials.store.store import write_atomically
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.off_target import usual_weights
-from grounded_trials.workspace.user_files.config import Config, set_target
+from grounded_trials.workspace.user_files.config import OFFERED, Config, as_toml, put
 from grounded_trials.workspace.user_files.task_file import (
     check_tables,
     limited_changes,
@@ -29,6 +32,8 @@ from grounded_trials.workspace.user_files.task_file import (
 
 PROPOSE = NextCommand("propose")
 TARGET = NextCommand("target", ("SHAPE",))
+MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
+OFFER = re.compile(r"(?m)^# terminal = \{.*\}$")
 
 
 def to_plan(workspace: Folder) -> NextCommand:
@@ -63,13 +68,10 @@ def replace_target(
     Both files are kept as they were, with `.bak` behind their names.
     """
     columns = checked(columns, model)
-    rows = len(next(iter(columns.values())))
-    check_tables(config, model, rows)
-    each = usual_weights(model, columns)  # of ranges such as 1800 mm
-    weights = {name: float(f"{w:.6g}") for name, w in each.items() if name not in only_at_end}
+    check_tables(config, model, len(next(iter(columns.values()))))
     name = config.task.target or "target.csv"
     path = config.file.parent / name
-    usual, given, old = dict[str, float](), dict[str, Array](), None
+    given, old = dict[str, Array](), None
     if path.is_file():
         try:
             old = path.read_bytes()
@@ -77,22 +79,12 @@ def replace_target(
             raise unreadable(path, error) from None
         with suppress(GroundedError, ValueError):  # an unreadable target is replaced
             names, values = read_target(path)
-            given = dict(zip(names[1:], values.T[1:], strict=True))
-            usual = usual_weights(model, given)
+            given = dict(zip(names[1:], values.T[1:], strict=True)) if len(values) else {}
         write_atomically(path.with_name(path.name + ".bak"), old)
         write_atomically(config.file.with_name(config.file.name + ".bak"), config.file.read_bytes())
     write_target(path, config.task.dt, columns)
     try:
-        set_target(
-            config.file,
-            name,
-            rows - 1,
-            weights,
-            usual,
-            limited_changes(config, model),
-            terminal,
-            [one for one in given if one not in columns],
-        )
+        set_target(config, model, columns, given, terminal, only_at_end)
     except BaseException:
         if old is None:
             path.unlink(missing_ok=True)
@@ -100,6 +92,80 @@ def replace_target(
             write_atomically(path, old)
         raise
     return path
+
+
+def set_target(
+    config: Config,
+    model: Model,
+    columns: Mapping[str, Array],
+    given: Mapping[str, Array],
+    terminal: Mapping[str, float],
+    only_at_end: Collection[str],
+) -> None:
+    """Write [task] target and horizon, and the weights of [reward] not chosen by the user.
+
+    [reward] state counts as not chosen if it is empty, has the usual weights of the target before
+    (`given`), or is 1 for each of its states (as `init --blank` writes it). In that case [reward]
+    input_change is replaced too, for the inputs whose weight is still what `init` wrote.
+    """
+    import tomlkit
+
+    each = usual_weights(model, columns)  # of ranges such as 1800 mm
+    weights = {name: float(f"{w:.6g}") for name, w in each.items() if name not in only_at_end}
+    text = config.file.read_text(encoding="utf-8-sig")
+    document, made, new = tomlkit.parse(text), made_changes(text), dict[str, Any]()
+    reward, blank = document.get("reward", {}), dict[str, float]()
+    own, ends, written = (dict(reward.get(k, {})) for k in ("state", "terminal", "input_change"))
+
+    # weights that nobody chose are renewed, and with them those that were offered for the end
+    before_it = usual_weights(model, given) if given else {}
+    usual = {k: w for k, w in before_it.items() if k in own or k not in ends}
+    alike = (one for one in (usual, dict.fromkeys(usual, 1.0)) if _alike(own, one))
+    before = next(alike, None)
+    if before is not None or not (own or ends):
+        was = usual if before is None else before
+        offered = {k for k, w in ends.items() if k in was and _near(w, OFFERED * was[k])}
+        ends = {
+            k: OFFERED * weights[k] if k in weights and k in offered else w
+            for k, w in ends.items()
+            if k in own or k in columns or k not in given
+        }
+        for name, (without, with_limits) in limited_changes(config, model).items():
+            if written.get(name, math.nan) in (without, made.get(name)):
+                blank[name] = with_limits
+        new = {"state": weights, "input_change": written | blank if blank else None}
+    ends = {k: float(f"{w:.6g}") for k, w in (dict(terminal) | ends).items()}
+    if ends != dict(reward.get("terminal", {})):
+        new["terminal"] = ends
+    rows = len(next(iter(columns.values())))
+    put(document, "task", {"target": config.task.target or "target.csv", "horizon": rows - 1})
+    put(document, "reward", new)
+    text = tomlkit.dumps(document)
+
+    # the comments that say what was offered, and what was written
+    if before and own:
+        offer = {name: float(f"{OFFERED * w:.6g}") for name, w in weights.items()}
+        text = OFFER.sub(f"# terminal = {as_toml(offer).as_string()}", text)
+    if made and blank:
+        text = MADE.sub(f"# input_change = {as_toml(made | blank).as_string()}", text)
+    write_atomically(config.file, text.encode())
+
+
+def made_changes(text: str) -> dict[str, float]:
+    """Return the `input_change` weights that `init --from` or `target` wrote, by their comment."""
+    found = MADE.search(text)
+    with suppress(tomllib.TOMLDecodeError):
+        weights = tomllib.loads(found[0].removeprefix("# "))["input_change"] if found else {}
+        return {name: w for name, w in weights.items() if isinstance(w, int | float)}
+    return {}
+
+
+def _alike(own: Mapping[str, float], weights: Mapping[str, float]) -> bool:
+    return own.keys() == weights.keys() and all(_near(own[k], w) for k, w in weights.items())
+
+
+def _near(one: float, weight: float) -> bool:
+    return abs(one - weight) <= 1e-3 * abs(weight)
 
 
 def checked(columns: Any, model: Model) -> dict[str, Array]:

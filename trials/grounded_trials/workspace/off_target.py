@@ -179,14 +179,14 @@ def usual_weights(model: Model, columns: Mapping[str, Array]) -> dict[str, float
     if axes := [own for name, own in ranges.items() if name in position and own > 0]:
         narrow = max(min(axes), NARROW * max(axes))
         ranges |= {name: narrow for name in ranges if name in position}
-    size, told = dict[str, float](), set[str]()  # by unit, and whether it tells a small error
+    units, size, told = model.states, dict[str, float](), set[str]()  # by unit: which tell an error
     for name, own in ranges.items():
-        unit, most = model.states[name], float(np.abs(columns[name]).max())
+        unit, most = units.get(name, ""), float(np.abs(columns[name]).max())
         size[unit] = max(size.get(unit, 0.0), own or most)
         told |= {unit} if own or most > UNKNOWN else set()
     weights = dict[str, float]()
     for name, own in ranges.items():
-        unit = model.states[name]
+        unit = units.get(name, "")
         width = own or (size[unit] if unit in told else UNKNOWN)
         weights[name] = (RATE if name in rates else 1.0) * max(width, SMALLEST_RANGE) ** -2
     return weights

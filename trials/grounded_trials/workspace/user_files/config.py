@@ -7,13 +7,9 @@ which keeps the user's comments and layout.
 
 from __future__ import annotations
 
-import re
-import tomllib
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from grounded.checks import refused
@@ -22,8 +18,6 @@ from grounded.search.step_size import SearchOptions
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import Table, read_toml
 
-MADE = re.compile(r"(?m)^# input_change = \{.*\}$")
-OFFER = re.compile(r"(?m)^# terminal = \{.*\}$")
 FILE = "grounded.toml"
 DRIVE = "drive.py"  # the robot's program, as `init` writes it
 UNWRITTEN = "drive.py: complete measure() and send() for your robot"  # in it until the user does
@@ -203,11 +197,12 @@ def set_keys(file: Path, table: str, **values: Any) -> None:
     import tomlkit
 
     document = tomlkit.parse(file.read_text(encoding="utf-8-sig"))
-    _put(document, table, values)
+    put(document, table, values)
     write_atomically(file, tomlkit.dumps(document).encode())
 
 
-def _put(document: Any, where: str, values: Mapping[str, Any]) -> None:
+def put(document: Any, where: str, values: Mapping[str, Any]) -> None:
+    """Replace keys in a table of a parsed grounded.toml, see `set_keys`."""
     import tomlkit
 
     table: Any = document.setdefault(where, tomlkit.table())
@@ -216,88 +211,3 @@ def _put(document: Any, where: str, values: Mapping[str, Any]) -> None:
             table[name] = as_toml(value)
         elif value is not None:
             table.pop(name, None)  # an empty value is equivalent to a missing key
-
-
-def set_target(
-    file: Path,
-    name: str,
-    steps: int,
-    weights: Mapping[str, float],
-    usual: Mapping[str, float],
-    changes: Mapping[str, tuple[float, float]],
-    terminal: Mapping[str, float] = MappingProxyType({}),
-    left: Sequence[str] = (),
-) -> None:
-    """Replace [task] target and horizon, and the weights of [reward] not chosen by the user.
-
-    [reward] state counts as not chosen if it is empty, equals `usual`, or is 1 for each of its
-    states (as `init --blank` writes it). In that case [reward] input_change is replaced too, for
-    the inputs whose weight is still what `init` wrote.
-
-    Args:
-        file: grounded.toml.
-        name: the file of the target.
-        steps: the horizon.
-        weights: the new weights of states.
-        usual: the weights that the previous target gave.
-        changes: by input, its weight on changes without [limits], and with them.
-        terminal: weights for [reward] terminal of states that have none there.
-        left: states with a column in the previous target alone, whose weights at the end go too.
-    """
-    import tomlkit
-
-    text = file.read_text(encoding="utf-8-sig")
-    document, made, new = tomlkit.parse(text), made_changes(text), dict[str, Any]()
-    reward, blank = document.get("reward", {}), dict[str, float]()
-    own, ends, written = (dict(reward.get(k, {})) for k in ("state", "terminal", "input_change"))
-
-    # weights that nobody chose are renewed, and with them those that were offered for the end
-    usual = {k: w for k, w in usual.items() if k in own or k not in ends}
-    alike = (one for one in (usual, dict.fromkeys(usual, 1.0)) if _alike(own, one))
-    before = next(alike, None)
-    if before is not None or not (own or ends):
-        old = usual if before is None else before
-        ends = {
-            k: OFFERED * weights[k]
-            if k in weights and k in old and _near(w, OFFERED * old[k])
-            else w
-            for k, w in ends.items()
-            if k in own or k not in left
-        }
-        blank = {
-            name: with_limits
-            for name, (without, with_limits) in changes.items()
-            if name in written and written[name] in (without, made.get(name))
-        }
-        new = {"state": weights, "input_change": written | blank if blank else None}
-    ends = {k: float(f"{w:.6g}") for k, w in (dict(terminal) | ends).items()}
-    if ends != dict(reward.get("terminal", {})):
-        new["terminal"] = ends
-    _put(document, "task", {"target": name, "horizon": steps})
-    _put(document, "reward", new)
-    text = tomlkit.dumps(document)
-
-    # the comments that say what was offered, and what was written
-    if before and own:
-        offered = {name: float(f"{OFFERED * w:.6g}") for name, w in weights.items()}
-        text = OFFER.sub(f"# terminal = {as_toml(offered).as_string()}", text)
-    if made and blank:
-        text = MADE.sub(f"# input_change = {as_toml(made | blank).as_string()}", text)
-    write_atomically(file, text.encode())
-
-
-def made_changes(text: str) -> dict[str, float]:
-    """Return the `input_change` weights that `init --from` or `target` wrote, by their comment."""
-    found = MADE.search(text)
-    with suppress(tomllib.TOMLDecodeError):
-        weights = tomllib.loads(found[0].removeprefix("# "))["input_change"] if found else {}
-        return {name: w for name, w in weights.items() if isinstance(w, int | float)}
-    return {}
-
-
-def _alike(own: Mapping[str, float], weights: Mapping[str, float]) -> bool:
-    return own.keys() == weights.keys() and all(_near(own[k], w) for k, w in weights.items())
-
-
-def _near(one: float, weight: float) -> bool:
-    return abs(one - weight) <= 1e-3 * abs(weight)
