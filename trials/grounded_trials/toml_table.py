@@ -21,6 +21,7 @@ from grounded.findings import found
 from grounded_trials.plain_file import read_file, unreadable
 
 SIZE_LIMIT = 2**22  # [bytes] of a file
+MUST_BE = {must: {"must": must} for must in ("positive", "natural")}  # metadata of a field
 T = TypeVar("T")
 
 
@@ -78,17 +79,19 @@ class Table:
     def into(self, kind: type[T], **read: Any) -> T:
         """Return the table as a dataclass; keys that are none of its fields are errors.
 
-        Its fields are of the kinds that `take` knows, but those in `read`, which are given.
+        Its fields are of the kinds that `take` knows, but those in `read`, which are given. What
+        a number must be is in the metadata of its field, `MUST_BE`.
         """
-        types, found = _types(cast(Any, kind)), dict(read)
-        self.expect(types)
-        for name, (of, default) in types.items():
-            if name in read:
-                continue
-            if default is MISSING and name not in self.values and get_origin(of) is not Mapping:
-                raise self.error(name, "given")
-            if name in self.values or default is MISSING:
+        known, found = _fields(cast(Any, kind)), dict(read)
+        self.expect(known)
+        for name, (of, one) in known.items():
+            if name not in read and (name in self or one.default is MISSING):
+                if name not in self and get_origin(of) is not Mapping:
+                    raise self.error(name, "given")
                 found[name] = self.take(name, of)
+            must, value = one.metadata.get("must"), found.get(name, 1)
+            if must and (value < 0 or (value == 0 and must == "positive")):
+                raise self.error(name, must, value)
         return kind(**found)
 
     def sub(self, key: str) -> Table:
@@ -121,10 +124,10 @@ class Table:
 
 
 @cache
-def _types(kind: Any) -> dict[str, tuple[Any, Any]]:
-    """Return the type and the default of each field of a dataclass."""
+def _fields(kind: Any) -> dict[str, tuple[Any, Any]]:
+    """Return the type of each field of a dataclass, and the field."""
     hints = get_type_hints(kind)
-    return {one.name: (hints[one.name], one.default) for one in fields(kind)}
+    return {one.name: (hints[one.name], one) for one in fields(kind)}
 
 
 def read_toml(path: Path) -> Table:

@@ -16,7 +16,7 @@ from grounded.checks import refused
 from grounded.errors import GroundedError
 from grounded.search.step_size import SearchOptions
 from grounded_trials.store.store import write_atomically
-from grounded_trials.toml_table import Table, read_toml
+from grounded_trials.toml_table import MUST_BE, Table, read_toml
 
 FILE = "grounded.toml"
 DRIVE = "drive.py"  # the robot's program, as `init` writes it
@@ -35,17 +35,17 @@ class ModelTable:
     params: Mapping[str, float] = field(default_factory=dict)
     effects: Effects = field(default_factory=dict)
     priors: Mapping[str, float] = field(default_factory=dict)
-    smoothing: float = 0.05
+    smoothing: float = field(default=0.05, metadata=MUST_BE["natural"])
 
 
 @dataclass(frozen=True)
 class TaskTable:
     """[task]: the time grid, the target and the start."""
 
-    dt: float
     start: Mapping[str, float]
     latency: Mapping[str, float]
-    horizon: int = 1
+    dt: float = field(metadata=MUST_BE["positive"])
+    horizon: int = field(default=1, metadata=MUST_BE["positive"])
     target: str = ""  # none: logs can be fitted and diagnosed, but nothing can be proposed
     feedback: bool = True
 
@@ -57,7 +57,7 @@ class SystemTable:
     command: str = ""
     model: str = ""
     noise: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    seed: int = 0
+    seed: int = field(default=0, metadata=MUST_BE["natural"])
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def read_config(folder: Path) -> Config:
     return Config(
         file=folder / FILE,
         model=_model(table.sub("model")),
-        task=_task(table.sub("task")),
+        task=table.sub("task").into(TaskTable),
         reward=table.sub("reward"),
         limits=limits,
         seen_in=seen_in,
@@ -123,16 +123,6 @@ def _model(table: Table) -> ModelTable:
     found = table.into(ModelTable, effects=effects)
     if bool(found.file) == bool(found.module):
         raise table.error("file", "one", found.file or found.module)
-    if found.smoothing < 0:
-        raise table.error("smoothing", "natural", found.smoothing)
-    return found
-
-
-def _task(table: Table) -> TaskTable:
-    found = table.into(TaskTable)
-    for key in ("dt", "horizon"):
-        if getattr(found, key) <= 0:
-            raise table.error(key, "positive", getattr(found, key))
     return found
 
 
@@ -154,8 +144,6 @@ def _system(table: Table) -> SystemTable:
     found = table.into(SystemTable, noise=kinds)
     if found.command and found.model:
         raise table.error("command", "alone", found.command)
-    if found.seed < 0:
-        raise table.error("seed", "natural", found.seed)
     return found
 
 
