@@ -31,10 +31,7 @@ if TYPE_CHECKING:
     from grounded_trials.workspace.adoption import adopt_effects
     from grounded_trials.workspace.adoption import undo_adoption as _undo_adoption
     from grounded_trials.workspace.candidates.exporting import export_in
-    from grounded_trials.workspace.candidates.proposing import (
-        propose_in,
-        status_in,
-    )
+    from grounded_trials.workspace.candidates.proposing import propose_in, status_in
     from grounded_trials.workspace.candidates.running import run_candidate
     from grounded_trials.workspace.diagnosing import diagnose_in, instruments_in
     from grounded_trials.workspace.discarding import discard_in, restore_in

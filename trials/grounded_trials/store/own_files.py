@@ -21,14 +21,7 @@ from grounded.checks import refused, unknown, wrong
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded_trials.formats.bad import BadSchema
-from grounded_trials.formats.mcap_records import (
-    MAGIC,
-    Attachment,
-    End,
-    Messages,
-    Metadata,
-    Schema,
-)
+from grounded_trials.formats.mcap_records import MAGIC, Attachment, End, Messages, Metadata, Schema
 from grounded_trials.formats.mcap_walk import (
     DamagedFile,
     Part,

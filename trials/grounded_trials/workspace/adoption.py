@@ -30,10 +30,7 @@ from grounded_trials.store.documents import read_as, write_document
 from grounded_trials.store.store import made_folder
 from grounded_trials.workspace.adopted import in_order, installed_effects, planner_of, settled
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import (
-    newer_alone,
-    read_diagnosis,
-)
+from grounded_trials.workspace.last_diagnosis import newer_alone, read_diagnosis
 from grounded_trials.workspace.new_target import to_plan
 from grounded_trials.workspace.readings import taken_out, twice_in_time
 from grounded_trials.workspace.user_files.config import (

@@ -26,10 +26,7 @@ from grounded.share import Share
 from grounded_trials.workspace.adopted import installed_effects
 from grounded_trials.workspace.adoption import diagnosed_again
 from grounded_trials.workspace.candidates.handover import outside_limits
-from grounded_trials.workspace.candidates.search_state import (
-    overtaken,
-    standing_in,
-)
+from grounded_trials.workspace.candidates.search_state import overtaken, standing_in
 from grounded_trials.workspace.identity import unsure_times
 from grounded_trials.workspace.last_diagnosis import (
     chosen,
@@ -37,10 +34,7 @@ from grounded_trials.workspace.last_diagnosis import (
     model_print,
     write_diagnosis,
 )
-from grounded_trials.workspace.next_step import (
-    DIAGNOSE,
-    after_diagnosis,
-)
+from grounded_trials.workspace.next_step import DIAGNOSE, after_diagnosis
 from grounded_trials.workspace.readings import one_message
 from grounded_trials.workspace.user_files.config import listed
 from grounded_trials.workspace.where_to_mend import where_to_mend

@@ -14,10 +14,7 @@ from grounded.result import UNSAID, Document
 from grounded.search.candidate import Candidate
 from grounded.search.standing import Phase
 from grounded_trials.plain_file import path_of
-from grounded_trials.workspace.candidates.exporting import (
-    Exported,
-    export_candidate,
-)
+from grounded_trials.workspace.candidates.exporting import Exported, export_candidate
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
