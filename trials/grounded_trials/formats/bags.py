@@ -10,50 +10,46 @@ A batch holds at most `BATCH` messages or `ROOM` bytes, so memory is bounded for
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from grounded.errors import GroundedError
-from grounded.findings import found
+from grounded.checks import refused
 from grounded_trials.formats.mcap_records import Channel, End, Header, Messages, Record, Schema
 
 BATCH, ROOM = 20_000, 64 * 2**20  # messages, bytes
+ZSTD = b"\x28\xb5\x2f\xfd"  # with which compressed data begin
 
 Piece = tuple[int, int, bytes]  # channel, time [ns], message
 
 
 def batches(pieces: Iterable[Piece]) -> Iterator[Messages]:
     """Collect single messages into batches."""
-    held: list[Piece] = []
+    pieces = iter(pieces)
+    while some := [*_first(pieces)]:
+        channels, times, parts = zip(*some, strict=True)
+        yield _batch(parts, channels, times)
+
+
+def _first(pieces: Iterator[Piece]) -> Iterator[Piece]:
     room = 0
-    for piece in pieces:
-        held.append(piece)
+    for piece in islice(pieces, BATCH):
+        yield piece
         room += len(piece[2])
-        if len(held) == BATCH or room > ROOM:
-            yield _batch(held)
-            held, room = [], 0
-    if held:
-        yield _batch(held)
+        if room > ROOM:
+            return
 
 
-def _batch(pieces: list[Piece]) -> Messages:
-    channels, times, parts = zip(*pieces, strict=True)
-    ends = np.cumsum(np.array([len(part) for part in parts], dtype=np.int64))
-    t = np.array(times, dtype=np.int64)
-    return Messages(
-        b"".join(parts),
-        np.concatenate([[0], ends[:-1]]),
-        ends,
-        np.array(channels, dtype=np.uint16),
-        np.arange(len(t), dtype=np.uint32),
-        t,
-        t,
-    )
+def _batch(parts: Sequence[bytes], channels: ArrayLike, times: ArrayLike) -> Messages:
+    ends, t = np.cumsum([len(part) for part in parts]), np.array(times, dtype=np.int64)
+    starts, numbers = np.r_[0, ends[:-1]], np.arange(len(t), dtype=np.uint32)
+    return Messages(b"".join(parts), starts, ends, np.array(channels, np.uint16), numbers, t, t)
 
 
 def sqlite_records(path: Path) -> Iterator[Record]:
@@ -73,36 +69,33 @@ def sqlite_records(path: Path) -> Iterator[Record]:
 def _tables(bag: Any, path: Path) -> Iterator[Record]:
     tables = {name for (name,) in bag.execute("SELECT name FROM sqlite_master WHERE type='table'")}
     if not {"topics", "messages"} <= tables:
-        raise GroundedError(found("file.no_log", str(path), head="SQLite"))
+        raise refused("file.no_log", path, head="SQLite")
     yield Header("ros2", "rosbag2 sqlite3")
-    known = _definitions(bag) if "message_definitions" in tables else {}
+    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+    rows = bag.execute(query) if "message_definitions" in tables else ()
+    known = {kind: (encoding, text) for kind, encoding, text in rows if text}
     topics = bag.execute("SELECT id, name, type, serialization_format FROM topics").fetchall()
-    kinds = list(dict.fromkeys(kind for _, _, kind, _ in topics))
-    numbers = {kind: i for i, kind in enumerate(kinds, start=1)}
-    for kind, number in numbers.items():
+    numbers = dict[str, int]()  # of the types that are defined
+    for kind in dict.fromkeys(kind for _, _, kind, _ in topics):
         encoding, text = known.get(kind) or ("ros2msg", _standard(kind))
         if text:
-            yield Schema(number, kind, encoding, text.encode())
+            numbers[kind] = len(numbers) + 1
+            yield Schema(numbers[kind], kind, encoding, text.encode())
     channels: dict[int, int] = {}
     for i, (identity, topic, kind, encoding) in enumerate(topics):
         channels[identity] = i
-        missing = not known.get(kind) and not _standard(kind)
-        yield Channel(i, topic, encoding, 0 if missing else numbers[kind], {})
-    yield from batches(_messages(bag, channels, path))
+        yield Channel(i, topic, encoding, numbers.get(kind, 0), {})
+    messages = bag.execute("SELECT topic_id, timestamp, data FROM messages")
+    yield from batches(
+        (_known(channels, topic, path), stamp, data) for topic, stamp, data in messages
+    )
     yield End(data_crc=False)
 
 
-def _definitions(bag: Any) -> dict[str, tuple[str, str]]:
-    query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
-    return {kind: (encoding, text) for kind, encoding, text in bag.execute(query) if text}
-
-
-def _messages(bag: Any, channels: dict[int, int], path: Path) -> Iterator[Piece]:
-    query = "SELECT topic_id, timestamp, data FROM messages"
-    for topic, stamp, data in bag.execute(query):
-        if topic not in channels:
-            raise GroundedError(found("file.damaged", str(path), part=f"channel {topic}"))
-        yield channels[topic], stamp, data
+def _known(channels: dict[int, int], topic: int, path: Path) -> int:
+    if topic not in channels:
+        raise refused("file.damaged", path, part=f"channel {topic}")
+    return channels[topic]
 
 
 def _standard(kind: str) -> str:
@@ -134,17 +127,19 @@ def ros1_records(path: Path) -> Iterator[Record]:
         yield End(data_crc=False)
 
 
-def expanded(batch: Messages) -> Messages:
-    """Decompress the messages of a batch one by one (rosbag2's zstd mode "message")."""
+def decompressed(batch: Messages) -> Messages:
+    """Decompress the messages of a batch if each is compressed (rosbag2's mode "message").
+
+    No CDR message begins like a zstd frame.
+    """
+    starts, ends = batch.starts.tolist(), batch.ends.tolist()
+    if not starts or batch.buffer[starts[0] : starts[0] + 4] != ZSTD:
+        return batch
     import zstandard
 
     decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
-    pieces: list[Piece] = []
-    columns = (batch.starts, batch.ends, batch.channels, batch.log_times)
-    for start, end, channel, time in zip(*(c.tolist() for c in columns), strict=True):
-        data = batch.buffer[start:end]
-        if data.startswith(b"\x28\xb5\x2f\xfd"):
-            with decoder.stream_reader(data) as reader:
-                data = reader.read()
-        pieces.append((channel, time, data))
-    return _batch(pieces)
+    parts = list[bytes]()
+    for start, end in zip(starts, ends, strict=True):
+        with decoder.stream_reader(batch.buffer[start:end]) as reader:
+            parts.append(reader.read())
+    return _batch(parts, batch.channels, batch.log_times)

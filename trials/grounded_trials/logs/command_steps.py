@@ -27,10 +27,11 @@ HELD = 0.5  # share of repeated rows above which rows are not written at changes
 def phase_of(
     changes: Floats, dt: float, late: Floats | None = None, *, whole_rows: bool = True
 ) -> tuple[float, float] | None:
-    """Return the phase within a step at which commands change, and its uncertainty.
+    """Return the phase within a step at which commands change, and by how much earlier it may be.
 
-    If table rows and commands have different periods, each change is seen late by another part of
-    a row; all changes together leave little uncertainty.
+    The latest possible one, -dt / 2 to dt / 2 [s]; None if the changes have no common phase. If
+    table rows and commands have different periods, each change is seen late by another part of a
+    row; all changes together leave little uncertainty.
 
     Args:
         changes: (K,) times at which a change was seen, from the beginning of a step [s].
@@ -38,10 +39,6 @@ def phase_of(
         late: (K,) largest delay with which each change may have been seen [s]; None: no delay.
         whole_rows: whether a change may be seen late by a whole row, as that of a program that
             sends when a row is written. Else changes at either of two rows are in no step.
-
-    Returns:
-        The latest possible phase, -dt / 2 to dt / 2, and by how much earlier it may be [s]; None if
-        the changes have no common phase.
     """
     if len(changes) <= FEW_CHANGES:
         return None
@@ -62,12 +59,7 @@ def phase_of(
 
 
 def changes_of(t: Ints, values: Floats) -> tuple[Ints, Ints]:
-    """Return when a command was seen to change (K,), and by how much that may be late (K,) [ns].
-
-    Args:
-        t: (N,) stamps [ns].
-        values: (N,) as for `held_rows`.
-    """
+    """Return when a command was seen to change (K,), and by how much that may be late (K,) [ns]."""
     rows, order = held_rows(t, values) > 0, np.argsort(t, kind="stable")
     t, values = t[order], values[order]
     new = np.flatnonzero(np.diff(values) != 0)
@@ -77,15 +69,9 @@ def changes_of(t: Ints, values: Floats) -> tuple[Ints, Ints]:
 def held_rows(t: Ints, values: Floats) -> float:
     """Return the interval of rows that repeat a held value [s], by which a change may be late.
 
-    A command that stays at its limits, or at zero before a run, repeats its value as well, however
-    often it is sent. So most values must be repeated, those at the limits aside.
-
-    Args:
-        t: (N,) stamps [ns].
-        values: (N,) a signal stamped at each change, or one that every row repeats.
-
-    Returns:
-        0 if rows do not repeat values.
+    0 if rows, with stamps t (N,) [ns], do not repeat values. A command that stays at its limits, or
+    at zero before a run, repeats its value as well, however often it is sent. So most values must
+    be repeated, those at the limits aside.
     """
     order = np.argsort(t, kind="stable")
     y = values[order]
@@ -110,24 +96,18 @@ def rows_apart(inputs: Sequence[Samples], states: Sequence[Samples]) -> float:
 
 
 def first_step(inputs: Sequence[Samples], start: int, dt: float) -> tuple[int, bool]:
-    """Return by how much to move the start of data [ns], and whether commands change in steps.
-
-    Args:
-        inputs: the commands.
-        start: from where every signal is known [ns].
-        dt: control step [s].
-    """
+    """Return by how much to move the start of data [ns], and whether commands change in steps."""
     at, late = (
         np.concatenate(x) for x in zip(*(changes_of(s.t, s.y) for s in inputs), strict=True)
     )
     found, first = np.unique(at, return_index=True)
     here = found >= start - round(dt * 0.5e9)
     later, late = found[here], late[first][here]
-    known, moved = phase_of((later - start) * 1e-9, dt, late * 1e-9, whole_rows=False), 0
-    phase = known and known[0]
-    if phase is not None and abs(phase) >= MOVED * dt:
-        moved = round((phase if phase > 0 else phase + dt) * 1e9)
-    return moved, phase is not None or len(later) <= FEW_CHANGES
+    known = phase_of((later - start) * 1e-9, dt, late * 1e-9, whole_rows=False)
+    if known is None:
+        return 0, len(later) <= FEW_CHANGES
+    phase = known[0]
+    return round((phase % dt) * 1e9) * (abs(phase) >= MOVED * dt), True
 
 
 def in_motion(inputs: Sequence[Samples], start: int, rest: Floats) -> bool:

@@ -15,9 +15,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, needs
-from grounded.findings import found
 from grounded_trials.formats import dataflash
+from grounded_trials.formats.bags import ZSTD, decompressed
 from grounded_trials.formats.lerobot import is_episode
 from grounded_trials.formats.mcap_records import MAGIC, Channel, Messages, Record, Rows
 from grounded_trials.formats.mcap_walk import mapped, read_records
@@ -29,7 +30,6 @@ from grounded_trials.within import within
 
 P = ParamSpec("P")
 T = TypeVar("T")
-_ZSTD = b"\x28\xb5\x2f\xfd"
 
 
 @dataclass(frozen=True)
@@ -72,23 +72,15 @@ def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:
         head = stream.read(16)
         if not head:
             raise empty(path)
-        if not head.startswith(_ZSTD):
-            yield from _by_format(path, head, stream, layout)
-            return
-        with tempfile.TemporaryDirectory() as room:
-            inner = Path(room) / path.stem
-            _expand(path, stream, inner)
-            with inner.open("rb") as expanded:
-                yield from _by_format(inner, expanded.read(16), expanded, layout)
-
-
-def _by_format(path: Path, head: bytes, stream: BinaryIO, layout: Layout) -> Iterator[Record]:
-    if head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
-        yield from _guarded("MCAP log", path, read_records(mapped(stream), str(path)))
-    elif (format := _format_of(path, head)) is not None:
-        yield from _read_as(format, path, layout)
-    else:
-        raise GroundedError(found("file.no_log", str(path), begins=repr(head[:8])))
+        if head.startswith(ZSTD):
+            with tempfile.TemporaryDirectory() as room:
+                yield from log_records(_expanded(path, stream, Path(room)), layout)
+        elif head.startswith(MAGIC[:5]) or path.name.endswith(".mcap"):
+            yield from _guarded("MCAP log", path, read_records(mapped(stream), str(path)))
+        elif (format := _format_of(path, head)) is not None:
+            yield from _read_as(format, path, layout)
+        else:
+            raise refused("file.no_log", path, begins=repr(head[:8]))
 
 
 def _format_of(path: Path, head: bytes) -> Format | None:
@@ -112,8 +104,10 @@ def _read_as(format: Format, path: Path, layout: Layout) -> Iterator[Record]:
 
 
 def _guarded(kind: str, path: Path, records: Iterator[Record]) -> Iterator[Record]:
+    """Yield records, their messages decompressed; what a reader raises is told of the file."""
     try:
-        yield from map(_plain, records)
+        for record in records:
+            yield decompressed(record) if isinstance(record, Messages) else record
     except GroundedError:
         raise
     except Exception as error:  # a decoder raises whatever a damaged file leads to
@@ -121,30 +115,18 @@ def _guarded(kind: str, path: Path, records: Iterator[Record]) -> Iterator[Recor
         raise unreadable(path, why[:500], kind=kind) from error
 
 
-def _plain(record: Record) -> Record:
-    """Decompress the messages of a record if each is compressed (rosbag2's mode "message").
-
-    No CDR message begins like a zstd frame.
-    """
-    if isinstance(record, Messages) and len(record):
-        start = int(record.starts[0])
-        if record.buffer[start : start + 4] == _ZSTD:
-            from grounded_trials.formats.bags import expanded
-
-            return expanded(record)
-    return record
-
-
-def _expand(path: Path, stream: BinaryIO, target: Path) -> None:
+def _expanded(path: Path, stream: BinaryIO, room: Path) -> Path:
+    """Decompress a zstd file into a folder."""
     import zstandard
 
     stream.seek(0)
-    decoder = zstandard.ZstdDecompressor(max_window_size=2**27)
+    decoder, target = zstandard.ZstdDecompressor(max_window_size=2**27), room / path.stem
     try:
         with target.open("wb") as out:
             decoder.copy_stream(stream, out)
     except (zstandard.ZstdError, OSError) as error:
         raise unreadable(path, str(error), kind="zstd file") from error
+    return target
 
 
 def read_apart(
@@ -160,19 +142,13 @@ def read_apart(
     """
     files = log_files(paths)
     size = sum(one.stat().st_size for file in files for one in on_disk(file))
-    for file in files:
-        _load_library(file)
+    for file in files:  # the memory of a library is then not counted as the file's
+        if is_episode(file):
+            _load(EPISODE)
+        else:
+            with open_log(file) as stream:
+                _load(_format_of(file, stream.read(16)))
     return within(files[0], size, function, files, *args, **kwargs)
-
-
-def _load_library(file: Path) -> None:
-    """Import the library that reads a file: its own memory is then not counted as the file's."""
-    if is_episode(file):
-        format: Format | None = EPISODE
-    else:
-        with open_log(file) as stream:
-            format = _format_of(file, stream.read(16))
-    _load(format)
 
 
 def _load(format: Format | None) -> None:

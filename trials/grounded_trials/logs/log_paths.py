@@ -8,10 +8,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
+from grounded.checks import refused
 from grounded.errors import GroundedError, alike
-from grounded.findings import found
 from grounded_trials.formats import lerobot
 from grounded_trials.plain_file import open_file, read_file, unreadable
 
@@ -24,7 +24,6 @@ _LISTED = re.compile(
     re.MULTILINE,
 )
 _NO_LOG = re.compile(r"c\d{4,}\.\w+|target\.csv")  # an exported candidate, or a target
-_DIGITS = re.compile(r"(\d+)")
 
 
 def logs_in(path: Path) -> list[Path]:
@@ -42,8 +41,13 @@ def logs_in(path: Path) -> list[Path]:
         return lerobot.episodes(path)
     if (path / "grounded.toml").is_file() or _bag(path):
         return [path]
-    runs = _sorted(p for p in _listed(path) if p.name.endswith(KINDS) and not _is_none(p))
+    runs = _sorted(_logs(path))
     return runs if runs and len({*map(_width, runs)}) == 1 else [path]
+
+
+def _logs(folder: Path) -> list[Path]:
+    """Return the files of a folder that may be logs: no exported candidate, no target."""
+    return [p for p in _listed(folder) if p.name.endswith(KINDS) and not _NO_LOG.fullmatch(p.name)]
 
 
 def _width(path: Path) -> int:
@@ -65,26 +69,23 @@ def log_files(paths: str | Path | Sequence[str | Path]) -> tuple[Path, ...]:
     Raises:
         GroundedError: if a file is missing, or a folder has none.
     """
-    given = [paths] if isinstance(paths, str | Path) else list(paths)
     files: list[Path] = []
-    for path in map(Path, given):
+    for path in map(Path, [paths] if isinstance(paths, str | Path) else paths):
+        inside = [path]
         if path.is_dir():
             inside = [] if lerobot.is_dataset(path) else _bag(path)
             inside = inside or logs_in(path)[:1]
             if inside == [path]:
-                workspace = int((path / "grounded.toml").is_file())
-                tables = () if workspace else sorted(p.name for p in _listed(path))
-                several = tuple(n for n in tables if n.endswith(".csv"))[:NAMED]
-                facts: dict[str, Any] = {"tables": several} if len(several) > 1 else {}
-                raise GroundedError(found("file.no_log", str(path), own=workspace, **facts))
-            files.extend(inside)
-        else:
-            files.append(path)
+                own = int((path / "grounded.toml").is_file())
+                tables = sorted(p.name for p in _listed(path) if p.suffix == ".csv" and not own)
+                several = tuple(tables[:NAMED]) if len(tables) > 1 else None
+                raise refused("file.no_log", path, own=own, tables=several)
+        files.extend(inside)
     for path in files:
         if not path.exists() and not lerobot.is_episode(path):
             raise _missing(path)
     if not files:
-        raise GroundedError(found("file.missing", "log"))
+        raise refused("file.missing", "log")
     return tuple(files)
 
 
@@ -96,10 +97,10 @@ def _bag(folder: Path) -> list[Path]:
     except (OSError, UnicodeDecodeError) as error:
         raise unreadable(folder, str(error), kind="bag") from None
     names = list(dict.fromkeys(Path(name).name for name in _LISTED.findall(text)))
-    if names:  # names only: a listing can't lead out of its folder
-        missing = [name for name in names if not (folder / name).exists()]
-        if missing:
-            raise GroundedError(found("file.missing", missing[0], where=str(listing)))
+    for name in names:  # names only: a listing can't lead out of its folder
+        if not (folder / name).exists():
+            raise refused("file.missing", name, where=str(listing))
+    if names:
         return [folder / name for name in names]
     there = _listed(folder)
     bags = ([p for p in there if p.name.endswith(kind)] for kind in BAGS)
@@ -117,25 +118,18 @@ def _sorted(paths: Iterable[Path]) -> list[Path]:
     """Sort files by the numbers in their names: bag_2 before bag_10."""
 
     def natural(path: Path) -> list[tuple[int, str]]:
-        parts = _DIGITS.split(path.name)
+        parts = re.split(r"(\d+)", path.name)
         return [(int(part), "") if part.isdigit() else (-1, part) for part in parts]
 
     return sorted(paths, key=natural)
 
 
-def _is_none(path: Path) -> bool:
-    """Check whether a file is named like an exported candidate or a target, which are no logs."""
-    return _NO_LOG.fullmatch(path.name) is not None
-
-
 def _missing(path: Path) -> GroundedError:
     """Return the error for a file that does not exist, with the log that it may stand for."""
     if not path.parent.is_dir():
-        return GroundedError(found("file.missing", str(path), folder=str(path.parent)))
-    there = [p for p in path.parent.iterdir() if p.name.endswith(KINDS) and not _is_none(p)]
-    named = {p.stem: p.name for p in sorted(there)}  # endings make all names alike
-    close = named.get(alike(path.stem, named), "")
-    return GroundedError(found("file.missing", str(path), near=close))
+        return refused("file.missing", path, folder=str(path.parent))
+    named = {p.stem: p.name for p in sorted(_logs(path.parent))}  # endings make all names alike
+    return refused("file.missing", path, near=named.get(alike(path.stem, named), ""))
 
 
 def open_log(path: Path) -> BinaryIO:
@@ -156,7 +150,7 @@ def open_log(path: Path) -> BinaryIO:
 
 def empty(path: Path) -> GroundedError:
     """Return the error for a log without a single byte."""
-    return GroundedError(found("file.no_message", str(path), byte=0))
+    return refused("file.no_message", path, byte=0)
 
 
 def on_disk(log: Path) -> list[Path]:

@@ -13,12 +13,11 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from grounded.checks import unknown
+from grounded.checks import refused, unknown
 from grounded.errors import GroundedError
 from grounded.findings import Finding, found
 from grounded.model import Model
 from grounded_trials.formats.message_path import parse_path
-from grounded_trials.formats.messages import Floats
 from grounded_trials.formats.tables import AS_IT_SAYS, LATEST, Layout
 from grounded_trials.logs.resample import Crossing, Gridded, Span, to_grid
 from grounded_trials.logs.signals import Clock, Series, SignalSpec, read_signals
@@ -41,15 +40,12 @@ def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> L
     if not table.values:
         return None
     table.expect(("clock", "state", "input", "span", "columns", "rate"))
-    clock = table.take("clock", Clock, "header")
-    signals = {}
+    clock, signals = table.take("clock", Clock, "header"), list[dict[str, SignalSpec]]()
     for kind, names in (("state", states), ("input", inputs)):
         group = table.sub(kind)
         group.expect(names)
-        signals[kind] = {name: _signal(group.sub(name), clock) for name in names if name in group}
-    return LogMapping(
-        signals["state"], signals["input"], _span(table.sub("span")), layout_of(table)
-    )
+        signals.append({one: _signal(group.sub(one), clock) for one in names if one in group})
+    return LogMapping(signals[0], signals[1], _span(table.sub("span")), layout_of(table))
 
 
 def layout_of(table: Table) -> Layout:
@@ -70,8 +66,8 @@ def layout_of(table: Table) -> Layout:
 def _signal(table: Table, clock: str) -> SignalSpec:
     spec = table.into(SignalSpec)
     _check_path(table, spec.path)
-    _check_time(table, "max_age_s", spec.max_age_s)
-    _check_time(table, "delay_s", spec.delay_s)
+    for key, seconds in (("max_age_s", spec.max_age_s), ("delay_s", spec.delay_s)):
+        _check_time(table, key, seconds)
     if spec.max_age_s is not None and spec.max_age_s <= 0:
         raise table.error("max_age_s", "positive", spec.max_age_s)
     if spec.scale == 0:
@@ -109,12 +105,11 @@ def _end(table: Table, key: str) -> Any:
         time = table.take(key, float)
         _check_time(table, key, time)
         return time
-    crossing = table.sub(key)
-    given = crossing.into(Crossing)
-    _check_path(crossing, given.path)
-    if (given.above is None) == (given.below is None):
+    crossing = table.sub(key).into(Crossing)
+    _check_path(table.sub(key), crossing.path)
+    if (crossing.above is None) == (crossing.below is None):
         raise table.error(key, "crossing", value)
-    return given
+    return crossing
 
 
 @dataclass(frozen=True)
@@ -127,11 +122,7 @@ class LogMapping:
     layout: Layout = AS_IT_SAYS
 
     def since(self, before: Mapping[str, float]) -> LogMapping:
-        """Return it with the values of inputs until their first samples.
-
-        Raises:
-            GroundedError: for a name that is no input.
-        """
+        """Return it with the values of inputs, of these names only, until their first samples."""
         for name in before:
             if name not in self.inputs:
                 raise unknown("input", name, self.inputs, of="[log]")
@@ -145,40 +136,16 @@ def read_log(
     dt: float,
     *,
     states: Sequence[str] | None = None,
-    angles: Sequence[str] = (),
-    steps: int | None = None,
-    rest: Floats | None = None,
-    rates: Sequence[str] = (),
+    **how: Any,
 ) -> Gridded:
-    """Read a log and sample it every dt.
+    """Read a log, or several in order, and sample it every dt [s].
 
-    Args:
-        paths: a log file, several in order, or the folder of a bag.
-        mapping: the signal of each state and input.
-        dt: control interval [s].
-        states: the mapped states to read, in array order; all of them by default.
-        angles: states to unwrap.
-        steps: at most this many steps.
-        rest: (m,) inputs at rest: the start is moved to a step of the commands, see `to_grid`.
-        rates: states that are velocities, see `to_grid`.
-
-    Raises:
-        GroundedError: see `signals.read_signals` and `resample.to_grid`.
+    `states` are those to read, in array order, all mapped ones by default; for `how`, and for what
+    is refused, see `to_grid`.
     """
-    states = list(mapping.states) if states is None else states
-    inputs = list(mapping.inputs)
+    states, inputs = list(mapping.states) if states is None else states, list(mapping.inputs)
     series = mapped_signals(paths, mapping, states, inputs)
-    return to_grid(
-        series,
-        dt,
-        states,
-        inputs,
-        mapping.span,
-        angles=angles,
-        steps=steps,
-        rest=rest,
-        rates=rates,
-    )
+    return to_grid(series, dt, states, inputs, mapping.span, **how)
 
 
 def mapped_signals(
@@ -193,17 +160,16 @@ def mapped_signals(
         GroundedError: see `signals.read_signals`.
     """
     if missing := ["state"] * (not states) + ["input"] * (not inputs):
-        raise GroundedError(found("log.no_signal", *missing, what="any"))
+        raise refused("log.no_signal", *missing, what="any")
     paths_of = {mapping.states[name].path: name for name in states}
-    same = [name for name in inputs if mapping.inputs[name].path in paths_of]
-    if same:
-        path = mapping.inputs[same[0]].path
-        places = f"[log.state.{paths_of[path]}]", f"[log.input.{same[0]}]"
-        raise GroundedError(found("given.twice", *places, name=path))
+    for name in inputs:
+        if (path := mapping.inputs[name].path) in paths_of:
+            places = f"[log.state.{paths_of[path]}]", f"[log.input.{name}]"
+            raise refused("given.twice", *places, name=path)
     specs = {name: mapping.states[name] for name in states}
-    specs |= {name: mapping.inputs[name] for name in inputs}
-    series = read_signals(paths, {**specs, **mapping.span.signals()}, mapping.layout)
-    return series | {name: _with_row_before(one) for name, one in series.items() if name in inputs}
+    specs |= {name: mapping.inputs[name] for name in inputs} | mapping.span.signals()
+    series = read_signals(paths, specs, mapping.layout)
+    return series | {name: _with_row_before(series[name]) for name in inputs}
 
 
 def _with_row_before(series: Series) -> Series:
@@ -213,13 +179,11 @@ def _with_row_before(series: Series) -> Series:
         return series
     apart = np.diff(np.sort(series.t))
     interval = int(np.median(apart)) if len(apart) else 10**9
-    raw = (spec.before - spec.offset) / spec.scale
-    t, logged = series.t[first] - interval, series.log_times[first] - interval
     return replace(
         series,
-        t=np.concatenate([[t], series.t]),
-        values=np.concatenate([[raw], series.values]),
-        log_times=np.concatenate([[logged], series.log_times]),
+        t=np.r_[series.t[first] - interval, series.t],
+        values=np.r_[(spec.before - spec.offset) / spec.scale, series.values],
+        log_times=np.r_[series.log_times[first] - interval, series.log_times],
     )
 
 

@@ -21,19 +21,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.findings import Finding, found
+from grounded.checks import refused
+from grounded.findings import Finding
 from grounded_trials.formats.messages import Floats, Ints
-from grounded_trials.logs.command_steps import (
-    first_step,
-    in_motion,
-    rows_apart,
-)
+from grounded_trials.logs.command_steps import first_step, in_motion, rows_apart
 from grounded_trials.logs.samples import (
     REGULAR,
     SPARSE,
-    How,
-    Lead,
     Samples,
     at_rest,
     check_overlap,
@@ -51,6 +45,7 @@ from grounded_trials.logs.signals import Clock, Series, SignalSpec
 START, END = "[log.span] start", "[log.span] end"  # names of the series that a span watches
 ABSOLUTE_S = 1e8  # larger times are stamps, not relative to the beginning of the log
 STEP_LIMIT = 2_000_000
+NEVER = -(2**63)  # before every stamp [ns]
 
 
 @dataclass(frozen=True)
@@ -93,15 +88,12 @@ class Gridded:
     states: Floats  # (T + 1, n)
     inputs: Floats  # (T, m)
     start_inputs: Floats | None  # (m,) held before t = 0; None if the log does not contain them
-    assumed: bool  # the log does not contain them, so they are None or as in its first row
     start_states: Mapping[str, float]  # at t = 0, as the samples before show them; see `Trial`
     start_ns: int  # t = 0 on the signals' clock [ns]
     origin_ns: int  # stamp of the first sample of any signal, on the same clock [ns]
     late_s: float  # shift of the start because a state was not known yet [s]
-    moved_s: float  # further shift to where the commands change [s]
     row_s: float  # interval of rows that repeat commands, by which these may be logged late [s]
     early: Callable[[], float]  # by which responses may begin early between two samples [s]
-    last_ns: int  # last sample of the state whose samples end first, on the same clock [ns]
     told: Callable[[], tuple[tuple[SignalReport, ...], tuple[Finding, ...]]]  # of its signals
 
     @property
@@ -167,98 +159,76 @@ def to_grid(
     for one in (*tracked, *(one for one in sent if one.spec.resample == "linear")):
         one.check_linear(dt)
 
-    # Where the trial begins and ends.
+    # Where the trial begins: of data, where commands change in steps; and where it ends.
     known, until = _extent(measured, sent, dt)
     origin = min(s.first_stamp if s.spec.before is None else _begun(s) for s in samples.values())
-    start, late = _start(span, series, measured, sent, known, origin)
-    begun = _Commands.at(start, dt, sent, tracked, rates, rest, past)
-    start += begun.moved
-    stop = min(until, _end(span, series, start, origin, until))
-    count = _steps(start, stop, dt, steps, origin, stamped_otherwise(samples.values(), dt))
+    if isinstance(span.start, str):
+        asked = max(map(_begun, sent))
+    else:
+        asked = _instant(span.start, START, series, origin, NEVER)
+    # moved to a sample if a state is not known yet; a given one may be a little before (`slack`)
+    start = asked if asked >= known else max(int(one.t[0]) for one in measured)
+    late = (start - asked) * 1e-9
+    if past is not None:  # for an input of which nothing was sent in the first step
+        before, half = start - round(dt * 1e9), start + dt * 0.5e9
+        pairs = zip(sent, past.tolist(), strict=True)
+        sent = [one.held_from(before, u) if one.t[0] > half else one for one, u in pairs]
+    still, usual = False, "hold"
+    if rest is not None:
+        still = at_rest({one.name: one.leading_to(start) for one in tracked}, rates)
+        moved, in_steps = first_step(sent, start, dt)
+        start, usual = start + moved, "hold" if in_steps else "mean"
+    if span.end is not None:
+        until = min(until, _instant(span.end, END, series, origin, start))
+    count = _steps(start, until, dt, steps, origin, stamped_otherwise(samples.values(), dt))
 
     # The values: of states at the grid, of inputs in the middle of its steps.
     grid = start + np.round(dt * 1e9 * np.arange(count + 1)).astype(np.int64)
     middle = start + np.round(dt * 1e9 * (np.arange(count) + 0.5)).astype(np.int64)
     at = dict.fromkeys(states, grid) | dict.fromkeys(inputs, middle)
-    whole = dict(zip(names, (*measured, *begun.sent), strict=True))
-    usual: dict[str, How] = {
-        **dict.fromkeys(states, "linear"),
-        **dict.fromkeys(inputs, begun.usual),
-    }
-    values = {n: whole[n].sampled(whole[n].spec.resample or usual[n], at[n], dt, start) for n in at}
+    how: dict[str, Any] = dict.fromkeys(states, "linear") | dict.fromkeys(inputs, usual)
+    whole = dict(zip(names, (*measured, *sent), strict=True))
+    values = {n: s.sampled(s.spec.resample or how[n], at[n], dt, start) for n, s in whole.items()}
 
     def told() -> tuple[tuple[SignalReport, ...], tuple[Finding, ...]]:
         own = ((samples[n], series[n], values[n], at[n]) for n in names)
         reports = tuple(report_of(*one, start) for one in own)
-        cut = stop == until and (steps is None or count < steps) and span.end is None
+        cut = (steps is None or count < steps) and span.end is None
         gone = vanished(measured, int(grid[-1] + dt * 1e9)) if cut else []
         return reports, (*findings_of(reports, late), *clocks, *gone)
 
-    held, assumed = begun.held_before(start, dt, rest)
+    # The states where it begins: their mean at rest, else, or without a velocity, where a line
+    # leads; a boat that drifts is not where it was on average.
+    leads = {one.name: one.leading_to(start) for one in tracked}
+    stood = bool(rates) and at_rest(leads, rates)
     return Gridded(
         states=np.column_stack([values[name] for name in states]),
         inputs=np.column_stack([values[name] for name in inputs]),
-        start_inputs=held,
-        assumed=assumed,
-        start_states=_start_states({one.name: one.leading_to(start) for one in tracked}, rates),
+        start_inputs=_held_before(sent, start, dt, rest, still),
+        start_states={
+            name: one.mean if stood else one.line
+            for name, one in leads.items()
+            if one and (stood or one.exact)
+        },
         start_ns=start,
         origin_ns=origin,
         late_s=late,
-        moved_s=begun.moved * 1e-9,
-        row_s=rows_apart(begun.sent, measured),
+        row_s=rows_apart(sent, measured),
         early=lambda: max((begins_early(one, grid) for one in tracked), default=0.0),
-        last_ns=min(int(one.t[-1]) for one in measured),
         told=told,
     )
 
 
-@dataclass(frozen=True)
-class _Commands:
-    """The inputs from where every signal is known on."""
-
-    sent: Sequence[Samples]
-    moved: int  # shift of the start to where they change [ns]
-    usual: How  # how they are sampled: changes in no steps have a mean
-    still: bool  # whether the robot stood still until then
-
-    @classmethod
-    def at(
-        cls,
-        start: int,
-        dt: float,
-        sent: Sequence[Samples],
-        tracked: Sequence[Samples],
-        rates: Sequence[str],
-        rest: Floats | None,
-        past: Floats | None,
-    ) -> _Commands:
-        """Find the first step at or after a start [ns]; for the others see `to_grid`."""
-        before = start - round(dt * 1e9)
-        if past is not None:  # for an input of which nothing was sent in the first step
-            waits = (one.t[0] > start + dt * 0.5e9 for one in sent)
-            three = zip(sent, past.tolist(), waits, strict=True)
-            sent = [one.held_from(before, u) if wait else one for one, u, wait in three]
-        if rest is None:
-            return cls(sent, 0, "hold", False)
-        still = at_rest({one.name: one.leading_to(start) for one in tracked}, rates)
-        moved, in_steps = first_step(sent, start, dt)
-        return cls(sent, moved, "hold" if in_steps else "mean", still)
-
-    def held_before(self, start: int, dt: float, rest: Floats | None) -> tuple[Floats | None, bool]:
-        """Return the inputs before a run (m,), None if unknown, and if the log lacks one of them.
-
-        Args:
-            start: of the run [ns].
-            dt: control interval [s].
-            rest: (m,) inputs at rest.
-        """
-        held = np.array([one.before(start - round(dt * 0.5e9)) for one in self.sent])
-        if self.still and rest is not None:
-            held = np.where(np.isfinite(held), held, rest)
-        assumed = not np.isfinite(held).all()
-        if assumed and rest is not None and in_motion(self.sent, start, rest):
-            held = np.where(np.isfinite(held), held, [one.y[0] for one in self.sent])
-        return (held if np.isfinite(held).all() else None), assumed
+def _held_before(
+    sent: Sequence[Samples], start: int, dt: float, rest: Floats | None, still: bool
+) -> Floats | None:
+    """Return the inputs before a run (m,), those at rest if it stood still; None if unknown."""
+    held = np.array([one.before(start - round(dt * 0.5e9)) for one in sent])
+    if still and rest is not None:
+        held = np.where(np.isfinite(held), held, rest)
+    if rest is not None and not np.isfinite(held).all() and in_motion(sent, start, rest):
+        held = np.where(np.isfinite(held), held, [one.y[0] for one in sent])
+    return held if np.isfinite(held).all() else None
 
 
 def begins_early(samples: Samples, grid: Ints) -> float:
@@ -272,17 +242,6 @@ def begins_early(samples: Samples, grid: Ints) -> float:
     h = (samples.t[j] - samples.t[i]) * 1e-9
     f = np.clip((grid - samples.t[i]) * 1e-9 / h, 0.0, 1.0)
     return float(np.sqrt(np.mean((f * (1 - f) * h) ** 2) / 2))
-
-
-def _start_states(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> dict[str, float]:
-    """Return the values at t = 0 as the samples before tell, for the states of which they do.
-
-    That is their mean at rest, else, or without a velocity, where a line leads: a boat that drifts
-    is not where it was on average.
-    """
-    still = bool(rates) and at_rest(leads, rates)
-    known = {name: one for name, one in leads.items() if one and (still or one.exact)}
-    return {name: one.mean if still else one.line for name, one in known.items()}
 
 
 def _extent(measured: Sequence[Samples], sent: Sequence[Samples], dt: float) -> tuple[int, int]:
@@ -306,66 +265,21 @@ def _begun(samples: Samples) -> int:
     return int(samples.t[0 if samples.spec.before is None else 1])
 
 
-def _start(
-    span: Span,
-    series: Mapping[str, Series],
-    measured: Sequence[Samples],
-    sent: Sequence[Samples],
-    known: int,
-    origin: int,
-) -> tuple[int, float]:
-    """Return t = 0 [ns], and by how much it was moved because a state was not known yet [s].
-
-    A start that is moved is at a sample, a given one may be a little before the first (`slack`).
-    """
-    if isinstance(span.start, Crossing):
-        start = _crossing(span.start, series[START], "start", None)
-    elif isinstance(span.start, str):
-        start = max(map(_begun, sent))
-    else:
-        start = _time(span.start, origin)
-    if start >= known:
-        return start, 0.0
-    first = max(int(one.t[0]) for one in measured)
-    return first, (first - start) * 1e-9
-
-
-def _end(span: Span, series: Mapping[str, Series], start: int, origin: int, until: int) -> int:
-    if span.end is None:
-        return until
-    if isinstance(span.end, Crossing):
-        return _crossing(span.end, series[END], "end", start)
-    return _time(span.end, origin)
-
-
-def _time(seconds: float, origin: int) -> int:
-    return round(seconds * 1e9) + (0 if abs(seconds) >= ABSOLUTE_S else origin)
-
-
-def _crossing(crossing: Crossing, series: Series, which: str, after: int | None) -> int:
-    """Return the first stamp [ns] at which the watched signal is beyond its value."""
-    order = np.argsort(series.t, kind="stable")
-    t, y = series.t[order], series.values[order]
-    beyond = np.ones(len(t), dtype=np.bool_)
-    if crossing.above is not None:
-        beyond &= y > crossing.above
-    if crossing.below is not None:
-        beyond &= y < crossing.below
-    if after is not None:
-        beyond &= t > after
+def _instant(
+    end: float | Crossing, name: str, series: Mapping[str, Series], origin: int, after: int
+) -> int:
+    """Return the stamp [ns] of a time, or of the first sample that is beyond a signal's limit."""
+    if not isinstance(end, Crossing):
+        return round(end * 1e9) + (0 if abs(end) >= ABSOLUTE_S else origin)
+    order = np.argsort(series[name].t, kind="stable")
+    t, y = series[name].t[order], series[name].values[order]
+    sign, limit = (-1, end.below or 0.0) if end.above is None else (1, end.above)
+    beyond = (sign * (y - limit) > 0) & (t > after)
     if not beyond.any():
-        limits = {"above": crossing.above, "below": crossing.below}
-        wanted = " and ".join(f"{k} {v}" for k, v in limits.items() if v is not None)
-        facts: dict[str, Any] = {"given": f"{y.min():g} to {y.max():g}"}
-        raise GroundedError(
-            found(
-                "given.value",
-                f"[log.span] {which}: {crossing.path}",
-                like=wanted,
-                must="span",
-                **facts,
-            )
-        )
+        like = f"{'above' if sign > 0 else 'below'} {limit}"
+        given = f"{y.min():g} to {y.max():g}"
+        where = f"{name}: {end.path}"
+        raise refused("given.value", where, must="span", like=like, given=given)
     return int(t[np.argmax(beyond)])
 
 
@@ -378,7 +292,7 @@ def stamped_otherwise(samples: Iterable[Samples], dt: float) -> float:
 def _steps(start: int, stop: int, dt: float, most: int | None, origin: int, every: float) -> int:
     count = int(np.floor((stop - start) / (dt * 1e9) + 1e-6))
     if not 1 <= count <= STEP_LIMIT:
-        ends: dict[str, Any] = {"start": (start - origin) * 1e-9, "stop": (stop - origin) * 1e-9}
-        facts: dict[str, Any] = {"steps": max(count, 0), "dt": dt, "every": every}
-        raise GroundedError(found("file.steps", **facts, **ends))
+        begin, end = ((at - origin) * 1e-9 for at in (start, stop))
+        facts = {"steps": max(count, 0), "dt": dt, "every": every}
+        raise refused("file.steps", start=begin, stop=end, **facts)
     return count if most is None else min(count, most)

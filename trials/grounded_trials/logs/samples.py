@@ -10,13 +10,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal
-from weakref import WeakKeyDictionary
+from typing import Literal
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.errors import GroundedError
-from grounded.findings import found
 from grounded_trials.formats.messages import Floats, Ints
 from grounded_trials.logs.signals import Series, SignalSpec
 
@@ -85,58 +84,51 @@ class Samples:
         if len(self.t) < 2:
             raise _unusable(self.name, self.spec, "one")
         if self.interval > SPARSE * dt and self.spec.max_age_s is None:
-            facts: dict[str, Any] = {"path": self.spec.path, "every": self.interval, "dt": dt}
-            raise GroundedError(found("file.gap", self.name, **facts))
+            facts = {"path": self.spec.path, "every": self.interval, "dt": dt}
+            raise refused("file.gap", self.name, **facts)
 
     def sampled(self, how: How, at: Ints, dt: float, origin: int) -> Floats:
-        """Return values (M,) at times: by `linear`, `hold` or `mean`, which see."""
-        by = {"linear": self.linear, "hold": self.hold, "mean": self.mean}
+        """Return values (M,) at times [ns] of a grid of steps dt [s].
+
+        Linear: interpolated, up to half an interval beyond the ends. Hold: of the last sample
+        before each time (zero-order hold). Mean: of the held value over the step about each time.
+
+        Raises:
+            GroundedError: if a time is in a gap, or outside the samples, which are told in seconds
+                after `origin` [ns]; if a held sample is older than max_age_s, or older than the
+                largest gap and newer ones were not finite.
+        """
+        by = {"linear": self._linear, "hold": self._hold, "mean": self._mean}
         return by[how](at, dt, origin)
 
-    def linear(self, at: Ints, dt: float, origin: int) -> Floats:
-        """Interpolate values at times [ns]; up to half an interval beyond the ends is allowed.
-
-        Args:
-            at: (M,) times [ns].
-            dt: control step [s].
-            origin: the trial's start, for messages [ns].
-
-        Raises:
-            GroundedError: if a time is in a gap, or outside the samples.
-        """
+    def _linear(self, at: Ints, dt: float, origin: int) -> Floats:
         i, j = self.around(at)
         t0, t1 = self.t[i], self.t[j]
-        self._refuse_gaps(at, t0, t1, dt, origin)
+        limit = self.max_gap(dt)
+        wide = ((t1 - t0) * 1e-9 > limit) & (at > t0) & (at < t1)
+        if wide.any():
+            k = int(np.argmax(wide))
+            raise self._gap(t0[k], t1[k], limit, origin)
+        beyond = np.maximum(t0 - at, at - t1) * 1e-9 > self.slack(dt)
+        if beyond.any():
+            raise self._outside(origin, int(at[np.argmax(beyond)]))
         return self.y[i] + (at - t0) / (t1 - t0) * (self.y[j] - self.y[i])
 
-    def hold(self, at: Ints, dt: float, origin: int) -> Floats:
-        """Return the value of the last sample before each time (zero-order hold).
-
-        Raises:
-            GroundedError: if there is no such sample, or it is older than max_age_s; or older than
-                the largest gap, if newer ones were not finite.
-        """
+    def _hold(self, at: Ints, dt: float, origin: int) -> Floats:
         i = np.searchsorted(self.t, at, "right") - 1
         if (i < 0).any():
             raise self._outside(origin)
         limit = np.inf if self.spec.max_age_s is None else self.spec.max_age_s
-        age = (at - self.t[i]) * 1e-9
         lost = np.searchsorted(self.lost, at, "right") > np.searchsorted(self.lost, self.t[i])
         limits = np.where(lost, min(limit, self.max_gap(dt)), limit)
-        if (age > limits).any():
-            k = int(np.argmax(age > limits))
-            self._refuse(self.t[i[k]], at[k], limits[k], origin)
+        old = (at - self.t[i]) * 1e-9 > limits
+        if old.any():
+            k = int(np.argmax(old))
+            raise self._gap(self.t[i[k]], at[k], limits[k], origin)
         return self.y[i]
 
-    def mean(self, at: Ints, dt: float, origin: int) -> Floats:
-        """Return the mean of the held value over the step about each time; raises as `hold` does.
-
-        Args:
-            at: (M,) middles of the steps [ns].
-            dt: control step [s].
-            origin: the trial's start, for messages [ns].
-        """
-        held, half = self.hold(at, dt, origin), round(dt * 0.5e9)
+    def _mean(self, at: Ints, dt: float, origin: int) -> Floats:
+        held, half = self._hold(at, dt, origin), round(dt * 0.5e9)
         since = (self.t - self.t[0]) * 1e-9
         total = np.concatenate([[0.0], np.cumsum(self.y[:-1] * np.diff(since))])
         edges = []
@@ -181,36 +173,20 @@ class Samples:
         i = int(np.searchsorted(self.t, at, "right")) - 1
         return float(self.y[i]) if i >= 0 else float("nan")
 
-    def _refuse_gaps(self, at: Ints, t0: Ints, t1: Ints, dt: float, origin: int) -> None:
-        limit = self.max_gap(dt)
-        wide = (t1 - t0) * 1e-9 > limit
-        wide &= (at > t0) & (at < t1)
-        if wide.any():
-            k = int(np.argmax(wide))
-            self._refuse(t0[k], t1[k], limit, origin)
-        beyond = np.maximum(t0 - at, at - t1) * 1e-9 > self.slack(dt)
-        if beyond.any():
-            k = int(np.argmax(beyond))
-            raise self._outside(origin, int(at[k]))
-
     def slack(self, dt: float) -> float:
         """Return how far beyond the first and last sample a value is extrapolated [s]."""
         return 0.5 * min(self.interval, dt)
 
     def _outside(self, origin: int, at: int | None = None) -> GroundedError:
-        places = (("first", 0), ("last", -1))
-        ends: dict[str, Any] = {k: f"{(self.t[i] - origin) * 1e-9:.3f}" for k, i in places}
-        when = ends["first"] if at is None else f"{(at - origin) * 1e-9:.3f}"
-        path = self.spec.path
-        return GroundedError(found("file.gap", self.name, path=path, at=when, **ends))
+        first, last = (f"{(self.t[i] - origin) * 1e-9:.3f}" for i in (0, -1))
+        when = first if at is None else f"{(at - origin) * 1e-9:.3f}"
+        facts = {"path": self.spec.path, "at": when, "first": first, "last": last}
+        return refused("file.gap", self.name, **facts)
 
-    def _refuse(self, t0: int, t1: int, limit: float, origin: int) -> None:
-        facts: dict[str, Any] = {
-            "start": f"{(t0 - origin) * 1e-9:.3f}",
-            "end": f"{(t1 - origin) * 1e-9:.3f}",
-            "limit": limit,
-        }
-        raise GroundedError(found("file.gap", self.name, path=self.spec.path, **facts))
+    def _gap(self, t0: int, t1: int, limit: float, origin: int) -> GroundedError:
+        start, end = (f"{(t - origin) * 1e-9:.3f}" for t in (t0, t1))
+        facts = {"path": self.spec.path, "start": start, "end": end, "limit": limit}
+        return refused("file.gap", self.name, **facts)
 
 
 def at_rest(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> bool:
@@ -220,13 +196,10 @@ def at_rest(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> bool:
     )
 
 
-TIDIED: WeakKeyDictionary[Series, dict[tuple[str, bool], Samples]] = WeakKeyDictionary()
-
-
 def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     """Return the usable samples of a signal: sorted, finite, scaled, unwrapped.
 
-    They are kept for as long as the raw samples are: a run is sought at many instants of a log.
+    They are kept with the raw samples: a run is sought at many instants of a log.
 
     Args:
         name: of the signal, for messages.
@@ -236,10 +209,10 @@ def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     Raises:
         GroundedError: if there are none, or their clock jumps back.
     """
-    known, key = TIDIED.setdefault(series, {}), (name, unwrap)
-    if key not in known:
-        known[key] = _tidied(name, series, unwrap)
-    return known[key]
+    if (name, unwrap) not in series.tidied:
+        series.tidied[name, unwrap] = _tidied(name, series, unwrap)
+    tidied: Samples = series.tidied[name, unwrap]
+    return tidied
 
 
 def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
@@ -260,7 +233,7 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
     if len(back) and back.min() < -MIXED_S * 1e9:
         k = int(np.argmin(back))
         by = float(-back[k]) * 1e-9
-        raise GroundedError(found("file.clocks", name, by=by, sample=str(k)))
+        raise refused("file.clocks", name, by=by, sample=str(k))
     late, many = int((back < 0).sum()), DISORDERED * len(series.t)
     order = np.argsort(t, kind="stable")
     t, y = t[order], y[order]
@@ -280,13 +253,10 @@ def _tidied(name: str, series: Series, unwrap: bool) -> Samples:
 
 
 def unwound(y: Floats, *, least: float = 0.5) -> Floats:
-    """Unwrap an angle by the turn that it stays within: of radians, else of degrees.
+    """Unwrap an angle (N,) by the turn that it stays within: of radians, else of degrees.
 
-    One that goes further is continuous, and unwrapped as radians it would be folded.
-
-    Args:
-        y: (N,) values.
-        least: of a turn; no smaller step is the end of one.
+    One that goes further is continuous, and unwrapped as radians it would be folded. No step
+    smaller than `least` of a turn is the end of one.
     """
     width = np.ptp(np.quantile(y, MOSTLY))
     turn = next((turn for turn in (2 * np.pi, 360.0) if width < WHOLE * turn), np.inf)
@@ -294,16 +264,14 @@ def unwound(y: Floats, *, least: float = 0.5) -> Floats:
 
 
 def _unusable(name: str, spec: SignalSpec, what: str, values: int = 0) -> GroundedError:
-    return GroundedError(found("file.signal", name, path=spec.path, what=what, values=values))
+    return refused("file.signal", name, path=spec.path, what=what, values=values)
 
 
 def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
-    """Raise an error if some signals end before others begin: their stamps are on two clocks.
+    """Refuse signals that end before others begin: their stamps are on two clocks.
 
-    The end of a signal that is held, or sent rarely, is ignored: it stays in force after that.
-
-    Raises:
-        GroundedError: naming the signals of both clocks, and the delay_s that aligns them.
+    The end of a signal that is held, or sent rarely, is ignored: it stays in force after that. The
+    error names the signals of both clocks, and the delay_s that aligns them.
     """
     held = [s for s in states if s.spec.resample == "hold"]
     held += [s for s in inputs if len(s.t) <= REGULAR or s.spec.max_age_s is not None]
@@ -320,4 +288,4 @@ def check_overlap(states: Sequence[Samples], inputs: Sequence[Samples]) -> None:
         for s in moved
     )
     names = [s.name for s in (*early, *late)]
-    raise GroundedError(found("file.clocks", *names, apart=abs(by) * 1e-9, lines=lines))
+    raise refused("file.clocks", *names, apart=abs(by) * 1e-9, lines=lines)

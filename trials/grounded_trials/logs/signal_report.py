@@ -50,15 +50,10 @@ def report_of(
     samples: Samples, series: Series, values: Floats, at: Ints, origin: int
 ) -> SignalReport:
     """Return the report on a signal that has `values` at the times `at` [ns]."""
-    t = samples.t
-    gaps = np.diff(t) * 1e-9
-    inside = (t[1:] > at[0]) & (t[:-1] < at[-1])
-    widest, place = 0.0, 0.0
-    if inside.any():
-        i = int(np.flatnonzero(inside)[np.argmax(gaps[inside])])
-        widest, place = float(gaps[i]), float((t[i] - origin) * 1e-9)
+    t, gaps, bridged = samples.t, np.diff(samples.t) * 1e-9, 0
+    inside = np.where((t[1:] > at[0]) & (t[:-1] < at[-1]), gaps, 0.0)
+    i = int(np.argmax(inside)) if inside.any() else None
     low, high = np.percentile(gaps, [5, 95]) if len(gaps) else (0.0, 0.0)
-    bridged = 0
     if len(t) > 1:
         before, after = (t[some] for some in samples.around(at))
         wide = (after - before) * 1e-9 > BRIDGED * samples.interval
@@ -71,8 +66,8 @@ def report_of(
         samples=len(series.t),
         rate_hz=1 / samples.interval if len(t) > 1 else 0.0,
         jitter_s=float(high - low) / 2,
-        largest_gap_s=widest,
-        largest_gap_at_s=place,
+        largest_gap_s=0.0 if i is None else float(gaps[i]),
+        largest_gap_at_s=0.0 if i is None else float((t[i] - origin) * 1e-9),
         bridged=bridged,
         skew_s=series.skew_s,
         not_finite=samples.not_finite,
@@ -85,9 +80,7 @@ def report_of(
 def check_clocks(series: Mapping[str, Series]) -> list[Finding]:
     """Return what there is to say of signals whose clocks differ a little.
 
-    Raises:
-        GroundedError: for signals on different clocks, such as simulation time and log time, naming
-            two of them, and the difference.
+    Refuse those on different clocks, such as simulation time and log time.
     """
     behind = {name: one.skew_s or 0.0 for name, one in series.items()}  # None: the log's own
     first, last = min(behind, key=behind.__getitem__), max(behind, key=behind.__getitem__)
@@ -113,16 +106,11 @@ def vanished(series: Sequence[Samples], last: int) -> list[Finding]:
 def findings_of(reports: tuple[SignalReport, ...], late: float) -> list[Finding]:
     """Return what is odd in the signals of a trial; what several share is told once."""
     odd = [found("file.vanished", late=late)] if late > 0 else []
-    alike: dict[tuple[tuple[str, Any], ...], list[str]] = {}
+    alike: dict[tuple[Any, ...], list[str]] = {}
     for r in reports:
-        facts: dict[str, Any] = {
-            "lost": r.not_finite,
-            "bridged": r.bridged,
-            "single": int(r.samples == 1),
-            "stamps": r.stamps,
-        }
-        if any(facts.values()):
-            gap = Quantity(r.largest_gap_s, "s")
-            facts |= {"gap": gap, "samples": r.samples}
-            alike.setdefault(tuple(facts.items()), []).append(r.name)
-    return odd + [found("file.odd_values", *n, **dict(facts)) for facts, n in alike.items()]
+        facts = r.not_finite, r.bridged, int(r.samples == 1), r.stamps
+        if any(facts):
+            alike.setdefault((*facts, Quantity(r.largest_gap_s, "s"), r.samples), []).append(r.name)
+    keys = ("lost", "bridged", "single", "stamps", "gap", "samples")
+    rows = ((dict(zip(keys, facts, strict=True)), names) for facts, names in alike.items())
+    return odd + [found("file.odd_values", *names, **facts) for facts, names in rows]

@@ -8,7 +8,7 @@ times: when it was logged, when it was published, and its header's stamp.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,7 @@ import numpy as np
 
 from grounded.checks import near, refused
 from grounded.errors import GroundedError, NextCommand
-from grounded.findings import Finding, found
+from grounded.findings import Finding
 from grounded_trials.formats.bad import Bad, BadMessage, BadPath, BadSchema
 from grounded_trials.formats.mcap_records import About, Rows
 from grounded_trials.formats.mcap_walk import Part, Topic, by_topic
@@ -63,6 +63,7 @@ class Series:
     type: str  # of the topic's messages
     unit: str = ""  # that the file says
     findings: tuple[Finding, ...] = ()  # on its file
+    tidied: dict[tuple[str, bool], Any] = field(init=False, default_factory=dict)  # see `tidy`
 
     @cached_property
     def skew_s(self) -> float | None:
@@ -90,30 +91,26 @@ def _read_signals(
     files: tuple[Path, ...], specs: Mapping[str, SignalSpec], layout: Layout
 ) -> dict[str, Series]:
     collectors = [_Collector(name, spec) for name, spec in specs.items()]
-    topics, decoders = set[str](), dict[Topic, Decoder]()
+    topics, wanted = set[str](), dict[Topic, tuple[Decoder, list[_Collector]]]()
     for path in files:
         for one in by_topic(log_records(path, layout), str(path)):
             if isinstance(one, About):
                 for collector in collectors:
                     collector.unit = collector.unit or one.units.get(collector.path.text, "")
                     collector.findings += one.findings
-            elif isinstance(one, Part) and one.topic in decoders:
-                _collect(decoders[one.topic], _wanting(collectors, one.topic), one, str(path))
+            elif isinstance(one, Part) and one.topic in wanted:
+                _collect(*wanted[one.topic], one, str(path))
             elif isinstance(one, Topic):
                 topics.add(one.name)
-                wanting = _wanting(collectors, one)
-                try:
-                    decoders |= {one: decoder_of(one.channel, one.schema)} if wanting else {}
-                except BadSchema as error:
-                    raise wanting[0].misfit(one, str(path), error) from None
+                if wanting := [each for each in collectors if each.path.topic == one.name]:
+                    try:
+                        wanted[one] = decoder_of(one.channel, one.schema), wanting
+                    except BadSchema as error:
+                        raise wanting[0].misfit(one, str(path), error) from None
                 for collector in wanting:
                     collector.type = one.type
     _refuse_missing([one for one in collectors if not one.type], sorted(topics), str(files[0]))
     return {collector.name: collector.series() for collector in collectors}
-
-
-def _wanting(collectors: Sequence[_Collector], topic: Topic) -> list[_Collector]:
-    return [one for one in collectors if one.path.topic == topic.name]
 
 
 def _collect(decoder: Decoder, wanting: Sequence[_Collector], part: Part, file: str) -> None:
@@ -139,10 +136,9 @@ def _refuse_missing(missing: Sequence[_Collector], known: Sequence[str], file: s
     topic = missing[0].path.topic
     names = ", ".join(one.name for one in missing if one.path.topic == topic)
     few = 0 < len(known) <= TOPICS_NAMED  # the nearest name may be another's: /left for /port
-    others = {"known": tuple(known)} if few else near(topic, known)
-    then = NextCommand("inspect", (file,))
-    facts: dict[str, Any] = {"kind": "topic", "of": Path(file).name, "where": names}
-    raise refused("given.name", topic, **facts, then=then, **others)
+    facts: dict[str, Any] = {"known": tuple(known)} if few else near(topic, known)
+    facts |= {"kind": "topic", "of": Path(file).name, "where": names}
+    raise refused("given.name", topic, then=NextCommand("inspect", (file,)), **facts)
 
 
 class _Collector:
@@ -158,22 +154,23 @@ class _Collector:
 
     def misfit(self, topic: Topic, file: str, error: Bad, at: float | None = None) -> GroundedError:
         """Return the error for a topic that can't be read, or has no such number."""
-        facts: dict[str, Any] = {"topic": topic.name, "type": topic.type, "at": at}
-        facts |= {"why": error.finding.what, "file": file, "path": self.path.text}
-        return GroundedError(found("file.signal", self.name, **facts))
+        facts = {"topic": topic.name, "type": topic.type, "at": at, "path": self.path.text}
+        return refused("file.signal", self.name, why=error.finding.what, file=file, **facts)
 
     def collect(self, part: Decoded) -> None:
+        """Take the numbers of messages, and their times on the signal's clock."""
         self.messages += len(part.log_times)
-        by_header = self.spec.clock == "header"
-        values = evaluate(part, self.path, stamps=by_header)
-        if len(values.rows) > 1 and (np.diff(values.rows) == 0).any():
-            at = int(values.rows[np.argmax(np.diff(values.rows) == 0)])
+        values = evaluate(part, self.path, stamps=self.spec.clock == "header")
+        again = np.diff(values.rows) == 0
+        if again.any():
+            at = int(values.rows[np.argmax(again)])
             raise BadPath("path", expected="one value", at=f"{part.log_times[at] * 1e-9:.3f} s")
-        logged = part.log_times[values.rows]
-        if by_header and values.stamps is None and len(values.rows):
-            raise BadPath("decode", what="header stamp")
-        times = logged if values.stamps is None else values.stamps
-        if self.spec.clock == "publish":
+        times = logged = part.log_times[values.rows]
+        if self.spec.clock == "header":
+            if values.stamps is None and len(values.rows):
+                raise BadPath("decode", what="header stamp")
+            times = logged if values.stamps is None else values.stamps
+        elif self.spec.clock == "publish":
             times = part.publish_times[values.rows]
             if (times < 0).any():
                 at = int(values.rows[np.argmax(times < 0)])
@@ -181,14 +178,10 @@ class _Collector:
         self.parts.append((times, values.values, logged))
 
     def series(self) -> Series:
-        columns = [np.concatenate(part) for part in zip(*self.parts, strict=True)]
-        if not columns or not len(columns[0]):
-            facts: dict[str, Any] = {
-                "path": self.path.text,
-                "topic": self.path.topic,
-                "messages": self.messages,
-            }
-            raise GroundedError(found("file.signal", self.name, **facts))
-        t, values, log_times = columns
+        """Return what was gathered."""
+        if not any(len(values) for _, values, _ in self.parts):
+            facts = {"path": self.path.text, "topic": self.path.topic, "messages": self.messages}
+            raise refused("file.signal", self.name, **facts)
+        t, values, logged = (np.concatenate(part) for part in zip(*self.parts, strict=True))
         told = self.messages, self.type, self.unit, self.findings
-        return Series(self.spec, t, values, log_times, *told)
+        return Series(self.spec, t, values, logged, *told)
