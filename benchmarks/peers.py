@@ -1,6 +1,6 @@
-"""The solver's problems, and their solution by CasADi, Crocoddyl and JAX; `run.py` calls it.
+"""The solver's problems, and their solution by CasADi and Crocoddyl; `run.py` calls it.
 
-    python benchmarks/peers.py casadi|crocoddyl|jax CASE.npz BEST
+    python benchmarks/peers.py casadi|crocoddyl CASE.npz BEST
 
     car       n = 6 + 2 previous inputs, m = 2, H = 200: 10 s on a circle at 20 Hz, without the
               model's stall and braking, so that every solver sees smooth functions
@@ -15,7 +15,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
@@ -31,9 +30,6 @@ from grounded.search.first_guess import first_guess
 
 CLOSE = 1e-4  # relative distance from the best known cost at which a solver is done
 STEP = 6e-6  # of Crocoddyl's differences
-Solver = Callable[[SimpleNamespace], dict[str, object]]
-
-
 xp: ModuleType = np  # whose functions the smooth car calls; see `load`
 
 
@@ -138,13 +134,6 @@ def load(path: str, best: str, module: ModuleType) -> SimpleNamespace:
     return loaded
 
 
-def by_iterations(case: SimpleNamespace, solve: Callable[[int], float], repeats: int) -> dict:
-    """Return iterations until the best known cost, that cost, and the time."""
-    iterations = next((k for k in range(1, 30) if case.reached(solve(k))), 30)
-    ms = 1e3 * fastest(lambda: solve(iterations), repeats)
-    return {"iterations": iterations, "cost": solve(iterations), "ms": ms}
-
-
 def casadi(case: SimpleNamespace) -> dict[str, object]:
     """Ipopt, multiple shooting, exact sparse derivatives in CasADi's virtual machine."""
     import casadi as ca
@@ -239,69 +228,12 @@ def crocoddyl(case: SimpleNamespace) -> dict[str, object]:
         solver.solve(list(case.z), list(case.u), iterations, True)
         return solver.cost
 
-    found = by_iterations(case, solve, case.repeats)
-    backward = 1e3 * fastest(solver.backwardPass, 10)
-    version = crocoddyl.__version__
-    return found | {"peer": "Crocoddyl, NumPy", "version": version, "backward_ms": backward}
-
-
-def jax(case: SimpleNamespace) -> dict[str, object]:
-    """The same DDP written with scans and jitted, 64 bit; a reference, not a package."""
-    import jax
-    import jax.numpy as jnp
-
-    jax.config.update("jax_enable_x64", True)
-    n, m = case.n, case.m
-    R, S, target, weight = map(jnp.array, (case.R, case.S, case.target, case.weight))
-
-    def step(z, u):
-        return jnp.concatenate([jnp.stack(case.step(list(z[:n]), list(u))), u])
-
-    def stage(z, u, target, weight):
-        return weight @ (z[:n] - target) ** 2 + R @ u**2 + S @ (u - z[n:]) ** 2
-
-    @jax.jit
-    def iterate(z, u):
-        along = (z[:-1], u, target[:-1], weight[:-1])
-        A, B = jax.vmap(jax.jacfwd(step, (0, 1)))(z[:-1], u)
-        gradient = jax.vmap(jax.grad(stage, (0, 1)))(*along)
-        (l_zz, l_zu), (_, l_uu) = jax.vmap(jax.hessian(stage, (0, 1)))(*along)
-
-        def back(value, now):
-            v, V = value
-            A, B, l_z, l_u, l_zz, l_zu, l_uu = now
-            Q_z, Q_u = l_z + A.T @ v, l_u + B.T @ v
-            Q_zz, Q_uu, Q_uz = l_zz + A.T @ V @ A, l_uu + B.T @ V @ B, l_zu.T + B.T @ V @ A
-            both = -jax.scipy.linalg.solve(Q_uu, jnp.column_stack([Q_u, Q_uz]), assume_a="pos")
-            k, K = both[:, 0], both[:, 1:]
-            return (Q_z + Q_uz.T @ k, Q_zz + Q_uz.T @ K), (k, K)
-
-        end = jnp.concatenate([2 * weight[-1] * (z[-1, :n] - target[-1]), jnp.zeros(m)])
-        end_V = jnp.diag(jnp.concatenate([2 * weight[-1], jnp.zeros(m)]))
-        stages = (A, B, *gradient, l_zz, l_zu, l_uu)
-        _, (k, K) = jax.lax.scan(back, (end, end_V), stages, reverse=True)
-
-        def forward(now, data):
-            zbar, ubar, k, K = data
-            u = ubar + k + K @ (now - zbar)
-            after = step(now, u)
-            return after, (after, u)
-
-        _, (after, u) = jax.lax.scan(forward, z[0], (z[:-1], u, k, K))
-        z = jnp.concatenate([z[:1], after])
-        last = weight[-1] @ (z[-1, :n] - target[-1]) ** 2
-        return z, u, jax.vmap(stage)(z[:-1], u, target[:-1], weight[:-1]).sum() + last
-
-    def solve(iterations):
-        z, u = jnp.array(case.z), jnp.array(case.u)
-        for _ in range(iterations):
-            z, u, cost = iterate(z, u)
-        return float(cost)
-
-    started = time.process_time()
-    solve(1)
-    built, found = time.process_time() - started, by_iterations(case, solve, 5)
-    return found | {"peer": "JAX, a scan by hand", "version": jax.__version__, "build_s": built}
+    iterations = next((k for k in range(1, 30) if case.reached(solve(k))), 30)
+    return {
+        "peer": "Crocoddyl, NumPy", "version": crocoddyl.__version__, "iterations": iterations,
+        "cost": solve(iterations), "ms": 1e3 * fastest(lambda: solve(iterations), case.repeats),
+        "backward_ms": 1e3 * fastest(solver.backwardPass, 10),
+    }  # fmt: skip
 
 
 def main() -> None:
@@ -312,10 +244,6 @@ def main() -> None:
 
         module.abs = module.fabs  # NumPy's name
         found = casadi(load(path, best, module))
-    elif peer == "jax":
-        import jax.numpy as module
-
-        found = jax(load(path, best, module))
     else:
         found = crocoddyl(load(path, best, np))
     print(json.dumps({"case": Path(path).stem, **found}))

@@ -1,6 +1,6 @@
 """Compare the solver with its peers, as time ratios within one run; run by hand.
 
-    python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl jax
+    python -m venv /tmp/peers && /tmp/peers/bin/pip install numpy casadi crocoddyl
     python benchmarks/run.py --peers /tmp/peers/bin/python     solve alone, beside the peers
     python benchmarks/run.py process                           whole commands
 
@@ -58,7 +58,7 @@ def solve_part(options):
             print(f"\n{one.name}: H = {one.problem.horizon}, nz = {one.problem.nz}")
             show(ours, ours)
             path = str(one.save(Path(folder)))
-            for peer in ("crocoddyl", "casadi", "jax") if options.peers else ():
+            for peer in ("crocoddyl", "casadi") if options.peers else ():
                 command = [options.peers, "peers.py", peer, path, repr(best)]
                 environment = os.environ | {"PYTHONPATH": ROOM}
                 done = subprocess.run(

@@ -53,12 +53,7 @@ def located(path: str | Path) -> Path:
 
 
 def remember(named: str | Path, files: Callable[[Path], Iterable[Path]]) -> None:
-    """Add files to those recorded by `recorded`, if it is active.
-
-    Args:
-        named: the path as written in the model.py.
-        files: returns all files that belong to it; called only if `recorded` is active.
-    """
+    """Add the `files` of a path in a model.py to those recorded by `recorded`, if it is active."""
     if (read := _READ.get(None)) is not None:
         root = os.path.abspath(_root(named))  # noqa: PTH100 (links are kept as they are)
         every = (os.path.abspath(file) for file in files(located(named)))  # noqa: PTH100
@@ -71,11 +66,7 @@ def _root(path: str | Path) -> Path:
 
 
 def load(xml: Any) -> Any:
-    """Return the compiled file (an MjModel) of a path or of MJCF text; a compiled one as it is.
-
-    Raises:
-        GroundedError: if the file is missing or MuJoCo can't load it, with MuJoCo's reason.
-    """
+    """Return the compiled file (an MjModel) of a path or of MJCF text; a compiled one as it is."""
     mj = needs("mujoco")
     if isinstance(xml, mj.MjModel):
         return copy.deepcopy(xml)
@@ -96,13 +87,10 @@ def load(xml: Any) -> Any:
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the file and all files it uses, as far as MuJoCo lists them.
+    """Return an MJCF or URDF file and all files it uses, as far as MuJoCo lists them.
 
     MuJoCo does not list the meshes of a URDF, nor, before version 3.3, those of an MJCF file: they
     are looked up where MuJoCo looks for them.
-
-    Args:
-        path: an MJCF or URDF file that MuJoCo can load.
     """
     mj = needs("mujoco")
     listed = getattr(mj, "mju_getXMLDependencies", lambda name: [name])(str(path))

@@ -333,10 +333,7 @@ class MujocoStepper(Stepper):
         return found
 
     def _controls_for(self, model: Any, data: Any, asked: Array) -> Array | None:
-        """Return controls (m,) inside their limits, for the torques nearest to those asked (nv,).
-
-        None if torques don't follow the controls linearly.
-        """
+        """Return controls (m,) for the torques nearest to those asked (nv,); None if not linear."""
         columns = list(self.controls.columns)
         if self.controls.torques:
             return np.array(np.clip(asked[columns], *self._spans[:, -len(columns) :]))
@@ -358,10 +355,7 @@ class MujocoStepper(Stepper):
         return inside if linear else None
 
     def _substeps(self, dt: float) -> tuple[int, float]:
-        """Return the number of simulation steps in a control step, and their length [s].
-
-        A control step estimated from time stamps is slightly off; the steps are adjusted to it.
-        """
+        """Return number and length [s] of a control step's steps, fitted to time stamps."""
         h = self._own  # a control step is a whole multiple of it
         steps = round(dt / h)
         off = abs(steps * h - dt)

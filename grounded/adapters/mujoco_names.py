@@ -57,15 +57,7 @@ def states_of(compiled: Any) -> dict[str, str]:
 
 
 def kept_states(compiled: Any, without: Sequence[str]) -> NDArray[np.bool_]:
-    """Return which of the file's states are the model's, (nv + nv + na,).
-
-    Args:
-        compiled: the compiled file.
-        without: names of joints that are no states.
-
-    Raises:
-        GroundedError: for an unknown joint, or if no state is left.
-    """
+    """Return which of the file's states are the model's, (nv + nv + na,), `without` some joints."""
     names = [joint_name(compiled, j) for j in range(compiled.njnt)]
     for name in without:
         if name not in names:
@@ -287,11 +279,7 @@ class Setting:
 
 
 def setting_of(mj: Any, compiled: Any, spec: str) -> Setting:
-    """Return the parameter named "element.field".
-
-    Raises:
-        GroundedError: for a malformed name, an unknown field, or an unknown element.
-    """
+    """Return the parameter named "element.field"."""
     element, dot, name = spec.rpartition(".")
     if not dot or name not in FIELDS:
         raise unknown("parameter", spec, [f"{element or 'pole'}.{one}" for one in FIELDS])

@@ -62,10 +62,5 @@ class Stepper:
 
 
 def model_of(stepper: Stepper, **fields: Any) -> Model:
-    """Return the Model of a stepper, with its derivatives.
-
-    Args:
-        stepper: computes steps and derivatives.
-        fields: the other fields of Model: states, inputs, params, angles, name ...
-    """
+    """Return the Model of a stepper, with its derivatives."""
     return Model(step=stepper, jacobian=stepper.jacobian, **fields)

@@ -12,7 +12,6 @@ folder, so that a diagnosis can't reach the truth.
 from __future__ import annotations
 
 from grounded.challenge.cases import KINDS, Case, make, sealed
-from grounded.challenge.mechanism import simulator
 from grounded.challenge.score import Oracle, judge, of_crude, oracle, summary
 
 __all__ = [
@@ -24,6 +23,5 @@ __all__ = [
     "of_crude",
     "oracle",
     "sealed",
-    "simulator",
     "summary",
 ]

@@ -18,10 +18,11 @@ import numpy as np
 
 from grounded.challenge import systems
 from grounded.challenge.draws import JOINT, draw_effect, draw_withheld, values_of
-from grounded.challenge.mechanism import Mechanism, simulator
+from grounded.challenge.mechanism import Mechanism
 from grounded.challenge.truth import Disturbance, Truth
 from grounded.checks import known
 from grounded.effects import Effect, ParamFamily, scales_of
+from grounded.errors import needs
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
@@ -66,16 +67,13 @@ def make(
         param_error: relative errors of the model's parameters (uniform), instead of a random third
             of the cases with 5 %.
         noise: "white", "coloured" or "heavy", instead of mostly white (of all three for "none").
-
-    Raises:
-        GroundedError: for an unknown kind or system, or mechanisms without MuJoCo.
     """
     known("kind", [kind], KINDS, "the challenge")
     if only is not None:
         known("system", [only], systems.SYSTEMS, "the challenge")
     share = shares_of(groups)
     if only is None and "mujoco" in groups:
-        simulator()
+        needs("mujoco")
     for i in range(count):
         rng = np.random.default_rng([seed, KINDS.index(kind), i])
         name = only or str(rng.choice(list(share), p=list(share.values())))
@@ -86,11 +84,7 @@ def make(
 
 
 def shares_of(groups: Sequence[str]) -> dict[str, float]:
-    """Return the probability of each system.
-
-    Raises:
-        GroundedError: for an unknown group, or none.
-    """
+    """Return the probability of each system."""
     known("group", groups or [""], systems.GROUPS, "the challenge")
     weight = {g: max(len(groups) - 1, 1) if g == "own" else 1 for g in groups}
     total = sum(weight.values())
@@ -102,19 +96,6 @@ def shares_of(groups: Sequence[str]) -> dict[str, float]:
 def sealed(label: Mapping[str, Any]) -> str:
     """Return the hash under which a label is published before it is opened."""
     return hashlib.sha256(json.dumps(label, sort_keys=True).encode()).hexdigest()
-
-
-@dataclass(frozen=True)
-class _Setting:
-    """Random settings of a case other than its effect."""
-
-    dt: float
-    steps: int
-    trials: int
-    level: float
-    roughness: float
-    same_task: bool
-    kind: str
 
 
 def _case(
@@ -130,31 +111,26 @@ def _case(
     dt = 1.0 / float(rng.choice(system.rates))
     duration = float(rng.uniform(*system.duration))
     drawn = NOISE_KINDS[index % 3] if kind == "none" else rng.choice(NOISE_KINDS, p=[0.8, 0.1, 0.1])
-    setting = _Setting(
-        dt=dt,
-        steps=round(duration / dt),
-        trials=int(rng.integers(3, 9)),
-        level=float(rng.choice([0.5, 1.0, 2.0])),
-        roughness=float(rng.choice([0.5, 1.0, 3.0])),
-        same_task=bool(rng.random() < 0.3),
-        kind=noise or str(drawn),
-    )
+    times, count = np.arange(round(duration / dt)) * dt, int(rng.integers(3, 9))
+    level, roughness = float(rng.choice([0.5, 1.0, 2.0])), float(rng.choice([0.5, 1.0, 3.0]))
+    same_task = bool(rng.random() < 0.3)
     if (error := param_error) is None:
         error = 0.05 if kind == "single" and rng.random() < 0.33 else 0.0
     crude = _with_errors(system.model, error, rng)
-    plans = _plans(system, crude, setting, rng)
+    # the last two runs are in no case, but the numbers drawn for them are in the seeds of all sets
+    plans = _plans(system, crude, times, count + 2, same_task, rng)
     disturbance = Disturbance(
-        {k: v * setting.roughness for k, v in system.process.items()},
-        {k: v * setting.level for k, v in system.measurement.items()},
-        setting.kind,
+        {k: v * roughness for k, v in system.process.items()},
+        {k: v * level for k, v in system.measurement.items()},
+        noise or str(drawn),
         grows=system.grows,
     )
-    truth, label = _truth(kind, system, plans, setting, disturbance, rng)
-    # the last two runs are in no case, but the numbers drawn for them are in the seeds of all sets
-    runs = [_run(system, truth, plan, setting, rng) for plan in plans]
+    truth, label = _truth(kind, system, plans, dt, rng)
+    truth = replace(truth, disturbance=disturbance, latency=system.latency)
+    runs = [_run(system, truth, plan, dt, rng) for plan in plans]
     if system.built and any(map(partial(_lost, crude), runs, plans)):
         return None
-    label |= {"noise": setting.kind, "level": setting.level, "roughness": setting.roughness}
+    label |= {"noise": disturbance.kind, "level": level, "roughness": roughness}
     label |= {"param_error": error, "system": system.name, "kind": kind, "case": name}
     ones, none = np.ones(crude.n), np.zeros(crude.m)
     task = Task(
@@ -168,7 +144,7 @@ def _case(
         high=system.high,
         latency=np.array(system.latency or none),
     )
-    return Case(name, system.name, task, tuple(runs[: setting.trials]), label)
+    return Case(name, system.name, task, tuple(runs[:count]), label)
 
 
 def _with_errors(model: Model, error: float, rng: np.random.Generator) -> Model:
@@ -192,29 +168,28 @@ Plan = tuple[Array, Array, Array, Array]  # inputs (T, m), start (n,), target (T
 
 
 def _plans(
-    system: systems.SystemUnderTest, crude: Model, setting: _Setting, rng: np.random.Generator
+    system: systems.SystemUnderTest,
+    crude: Model,
+    t: Array,
+    count: int,
+    same_task: bool,
+    rng: np.random.Generator,
 ) -> list[Plan]:
-    """Draw a manoeuvre for each trial (or one for all, inputs slightly varied), and two more."""
-    t = np.arange(setting.steps) * setting.dt
+    """Draw a manoeuvre for each trial, or one for all, inputs slightly varied."""
     found: list[Plan] = []
-    for i in range(setting.trials + 2):
-        if i == 0 or not setting.same_task:
+    for i in range(count):
+        if i == 0 or not same_task:
             u, start = system.manoeuvre(rng, t, crude)
         else:
             spread = system.bend * (system.high - system.low)
             bend = np.column_stack([systems.wave(rng, t, 2, 0.1, 0.5) for _ in range(crude.m)])
             u, start = np.clip(found[0][0] + spread * bend, system.low, system.high), found[0][1]
-        target, gains = systems.regulator(system, crude, u, start, setting.dt)
-        found.append((u, start, target, gains))
+        found.append((u, start, *systems.regulator(system, crude, u, start, float(t[1]))))
     return found
 
 
 def _run(
-    system: systems.SystemUnderTest,
-    truth: Truth,
-    plan: Plan,
-    setting: _Setting,
-    rng: np.random.Generator,
+    system: systems.SystemUnderTest, truth: Truth, plan: Plan, dt: float, rng: np.random.Generator
 ) -> Trial:
     u, start, target, gains = plan
     model = truth.model
@@ -226,54 +201,39 @@ def _run(
     held = u[0] if system.settled else np.zeros(model.m)
     wobble = np.array([truth.disturbance.measurement.get(n, 0.0) for n in model.state_names])
     first = start + wobble * rng.standard_normal(model.n)
-    return truth.run(rng, control, first, held, setting.steps, setting.dt)
+    return truth.run(rng, control, first, held, len(u), dt)
 
 
 def _truth(
     kind: Kind,
     system: systems.SystemUnderTest,
     plans: list[Plan],
-    setting: _Setting,
-    disturbance: Disturbance,
+    dt: float,
     rng: np.random.Generator,
 ) -> tuple[Truth, dict[str, Any]]:
-    model, latency = system.model, system.latency
-    states = np.concatenate([plan[2] for plan in plans])
-    inputs = np.concatenate([plan[0] for plan in plans])
-    scales = scales_of(model, states, inputs, setting.dt, setting.steps * setting.dt)
-    if kind == "none":
-        return _built(system, Truth(model, disturbance=disturbance, latency=latency)), {
-            "effects": []
-        }
+    """Return the real system without its disturbance, and its label."""
+    model, duration, built = system.model, len(plans[0][0]) * dt, system.built is not None
+    inputs, states = (np.concatenate([plan[k] for plan in plans]) for k in (0, 2))
     if kind == "withheld":
         moved = np.diff(states[:, model.state_names.index(system.driven)])
-        rate = float(np.quantile(np.abs(moved), 0.9))
-        hidden = draw_withheld(
-            rng,
-            model,
-            np.abs(inputs - inputs.mean(axis=0)).max(axis=0) + 0.5 * np.abs(inputs).max(axis=0),
-            system.driven,
-            max(rate / setting.dt, 0.3),
-            setting.steps * setting.dt,
-            system.built is not None,
-        )
-        truth = Truth(model, (), disturbance, hidden.actuators, hidden.rates, latency)
+        rate = max(float(np.quantile(np.abs(moved), 0.9)) / dt, 0.3)
+        peak = np.abs(inputs - inputs.mean(axis=0)).max(axis=0) + 0.5 * np.abs(inputs).max(axis=0)
+        hidden = draw_withheld(rng, model, peak, system.driven, rate, duration, built)
+        truth = Truth(model, actuators=hidden.actuators, rates=hidden.rates)
         label = {"name": hidden.name, "target": hidden.target, "params": hidden.params}
         return _built(system, truth, hidden.joint), {"effects": [], "withheld": label}
+    scales = scales_of(model, states, inputs, dt, duration)
     effects: list[tuple[Effect, dict[str, float]]] = []
-    while len(effects) < (2 if kind == "double" else 1):
-        effect = draw_effect(model, scales, rng, JOINT if system.built else ())
+    while len(effects) < {"none": 0, "single": 1, "double": 2}[kind]:
+        effect = draw_effect(model, scales, rng, JOINT if built else ())
         if effect.name not in [e.name for e, _ in effects]:
-            effects.append((effect, values_of(effect, scales, rng, states, bool(system.built))))
-    true_model = model
-    for effect, values in effects:
-        if isinstance(effect.family, ParamFamily):
-            name = effect.site.target
-            true_model = true_model.with_values({name: true_model.params[name].value + values["d"]})
+            effects.append((effect, values_of(effect, scales, rng, states, built)))
+    shifts = {e.site.target: v["d"] for e, v in effects if isinstance(e.family, ParamFamily)}
+    shifted = {n: model.params[n].value + d for n, d in shifts.items()}
+    own = model.with_values(shifted) if shifts else model
     acting = tuple((e, v) for e, v in effects if not isinstance(e.family, ParamFamily))
     named = [{"effect": e.name, "params": dict(v)} for e, v in effects]
-    truth = Truth(true_model, acting, disturbance, latency=latency)
-    return _built(system, truth), {"effects": named}
+    return _built(system, Truth(own, acting)), {"effects": named}
 
 
 INSIDE = {"joint_friction": "friction", "added_inertia": "armature", "first_order_lag": "lag"}
@@ -293,5 +253,5 @@ def _built(
             for name in effect.site.targets:
                 part[kind][name.partition("<-")[0]] = size
     outside = tuple((e, v) for e, v in truth.effects if e.family.name not in INSIDE)
-    built = Mechanism(system.built, part, more or {})
+    built = partial(Mechanism, system.built, part, more or {})
     return replace(truth, effects=outside, mechanism=built)

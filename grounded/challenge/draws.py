@@ -57,14 +57,8 @@ def values_of(
 ) -> dict[str, float]:
     """Draw the values of an effect, from barely visible to large relative to the signals.
 
-    Of effects of 2 to 4 %, four in ten stayed below 3 nats; of larger ones, one in seven.
-
-    Args:
-        effect: the effect.
-        scales: sizes of the signals.
-        rng: random generator.
-        visited: states of the manoeuvres (N, n), so that a patch is at a visited place.
-        mechanism: whether the system is a mechanism, whose loop tolerates less delay.
+    Of effects of 2 to 4 %, four in ten stayed below 3 nats; of larger ones, one in seven. A patch
+    is at a state of `visited` (N, n); the loop of a `mechanism` tolerates less delay.
     """
     size = float(np.exp(rng.uniform(np.log(SMALLEST), np.log(LARGEST))))
     sign = float(rng.choice([-1, 1]))
@@ -213,17 +207,9 @@ def draw_withheld(
     duration: float,
     mechanism: bool = False,
 ) -> Withheld:
-    """Draw a withheld effect for a model.
+    """Draw a withheld effect for a model, of inputs of size `peak` (m,) and a state of this `rate`.
 
-    Args:
-        rng: random generator.
-        model: the system.
-        peak: typical size of each input (m,).
-        driven: the state that gusts and hysteresis act on.
-        rate: typical size of that state's rate.
-        duration: of a trial [s].
-        mechanism: whether the system is a mechanism, which gets a spring or a hanging mass instead
-            of gusts and hysteresis.
+    A mechanism gets a spring or a hanging mass instead of gusts and hysteresis.
     """
     makers = [_resonance, _dropouts, _fault, _quantised, _crosstalk]
     kind = int(rng.integers(0, len(makers) + 2))

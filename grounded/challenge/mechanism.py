@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -97,30 +96,21 @@ def _written(template: str, part: Part, **options: Any) -> str:
     return template.format(**given, lag=defaultdict(str, filters))
 
 
-@dataclass(frozen=True, eq=False)
 class Mechanism:
-    """A mechanism with what its crude model lacks.
+    """A running MuJoCo simulation, with the state of actuators, warm start and hanging mass.
 
-    `built` writes its XML. `part` has the kinds friction, armature and lag by input, and the "true"
-    parameters.
+    Args:
+        built: writes its XML.
+        part: what its crude model lacks: friction, armature and lag by input, "true" parameters.
+        more: spring, hung.
+        fine: time that it advances at once [s].
     """
 
-    built: Callable[..., str]
-    part: Part
-    more: Mapping[str, float] = field(default_factory=dict)  # spring, hung
-
-    def plant(self, fine: float) -> Plant:
-        """Return the mechanism at rest, which advances by `fine` seconds at a time."""
-        return Plant(self, fine)
-
-
-class Plant:
-    """A running MuJoCo simulation, with the state of actuators, warm start and hanging mass."""
-
-    def __init__(self, of: Mechanism, fine: float) -> None:
-        self.mj, self.steps = simulator(), int(np.ceil(fine / STEP))
-        step = fine / self.steps
-        xml = of.built(of.part, timestep=step, integrator="implicitfast", **of.more)
+    def __init__(
+        self, built: Callable[..., str], part: Part, more: Mapping[str, float], fine: float
+    ) -> None:
+        self.mj, self.steps = needs("mujoco"), int(np.ceil(fine / STEP))
+        xml = built(part, timestep=fine / self.steps, integrator="implicitfast", **more)
         self.model = self.mj.MjModel.from_xml_string(xml)
         self.data = self.mj.MjData(self.model)
         self.filtered = np.flatnonzero(self.model.actuator_actadr >= 0)  # that have a state
@@ -136,12 +126,3 @@ class Plant:
         for _ in range(self.steps):
             self.mj.mj_step(self.model, data)
         return np.concatenate([data.qpos[:half], data.qvel[:half]])
-
-
-def simulator() -> Any:
-    """Import MuJoCo.
-
-    Raises:
-        GroundedError: if it is not installed, with what to install.
-    """
-    return needs("mujoco")

@@ -47,17 +47,7 @@ class Oracle:
 def oracle(
     model: Model, trials: Sequence[Trial], latency: Array, label: Mapping[str, Any]
 ) -> Oracle | None:
-    """Fit the true effects of a case.
-
-    Args:
-        model: the crude model.
-        trials: the trials of the case.
-        latency: modelled delay of its inputs (m,) [s].
-        label: the opened label.
-
-    Returns:
-        The oracle; None if the label has no effect of the library.
-    """
+    """Fit the true effects of a case; None if the opened label has no effect of the library."""
     if not label["effects"]:
         return None
     data = prepare(model, trials, latency)

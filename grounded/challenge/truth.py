@@ -8,7 +8,7 @@ log. They share the equation of an effect, but no numerics.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,6 +18,7 @@ from grounded.challenge.mechanism import Mechanism
 from grounded.compile import Named
 from grounded.effects import (
     Effect,
+    Family,
     InputFamily,
     LossFamily,
     MediumFamily,
@@ -62,7 +63,8 @@ class Disturbance:
 class Truth:
     """The real system: a model with true parameters, effects, disturbances, withheld parts.
 
-    A mechanism replaces the model's derivative, and the effects that are built into it.
+    A mechanism, made for a fine step, replaces the model's derivative, and the effects that are
+    built into it.
     """
 
     model: Model
@@ -71,7 +73,7 @@ class Truth:
     actuators: tuple[Actuator, ...] = ()
     rates: tuple[Callable[[Any, Any, float, Mapping[str, Any]], Mapping[str, float]], ...] = ()
     latency: tuple[float, ...] = ()
-    mechanism: Mechanism | None = None
+    mechanism: Callable[[float], Mechanism] | None = None
 
     def run(
         self,
@@ -94,23 +96,27 @@ class _Run:
     ) -> None:
         self.truth, self.rng, self.dt, self.fine = truth, rng, dt, dt / FINE
         self.x, self.held = np.array(start, float), np.array(held, float)
-        model = truth.model
+        model = self.model = truth.model
         self.names = model.state_names
         self.p = Named("parameter", model.param_names, list(model.values))
         self.memory: dict[str, Any] = {}
         self.own_state: dict[str, Any] = {"rng": rng}
-        latency = truth.latency or (0.0,) * model.m
-        self.late = [divmod(seconds / self.fine, 1.0) for seconds in latency]
+        self.late = [divmod(by / self.fine, 1.0) for by in truth.latency or (0.0,) * model.m]
         self.settle()
         self.gust, self.last = np.zeros(model.n), self.held
+        self.plant = None if truth.mechanism is None else truth.mechanism(self.fine)
         pairs = ((n, partner(model, n)) for n in self.names)
-        self.plant = None if truth.mechanism is None else truth.mechanism.plant(self.fine)
         self.tied = [(self.names.index(n), self.names.index(k)) for n, k in pairs if k is not None]
         self.tie(0.0)
         self.past = [self.x.copy()]
 
+    def of(self, *kinds: type[Family]) -> Iterator[tuple[Effect, Any, Mapping[str, float]]]:
+        """Yield the effects of some kinds of families, with the family and the values."""
+        for effect, values in self.truth.effects:
+            if isinstance(effect.family, kinds):
+                yield effect, effect.family, values
+
     def trial(self, controller: Callable[[int, Array], Array], steps: int) -> Trial:
-        model = self.truth.model
         logged, inputs = [self.measure()], []
         for t in range(steps):
             u = np.asarray(controller(t, logged[-1]), float)
@@ -122,42 +128,34 @@ class _Run:
             self.past[-1] = self.x.copy()
             logged.append(self.measure())
             inputs.append(u)
-        names = (model.state_names, model.input_names)
-        states = np.array(logged)
-        return Trial(states, np.array(inputs), self.dt, *names, start_inputs=self.held)
+        names, made = (self.names, self.model.input_names), (np.array(logged), np.array(inputs))
+        return Trial(*made, self.dt, *names, start_inputs=self.held)
 
     def settle(self) -> None:
         """Initialise memories as settled at the held inputs."""
-        u, names = self.held.copy(), self.truth.model.input_names
-        for index, (effect, values) in enumerate(self.truth.effects):
-            for target in effect.site.targets:
-                family = effect.family
-                if isinstance(family, InputFamily):
-                    j = names.index(target)
-                    u[j] = family.effect(u[j], 0.0, values)
-                elif isinstance(family, MemoryFamily):
-                    depth = family.depth(values, self.fine)
-                    self.memory[f"{index}{target}"] = (u[names.index(target)],) * depth
-            if isinstance(effect.family, LossFamily):
+        u, names = self.held.copy(), self.model.input_names
+        for effect, family, values in self.of(InputFamily, MemoryFamily, LossFamily):
+            if isinstance(family, LossFamily):
                 held = u[names.index(coupled(effect.site)[0])]
-                self.memory[effect.name] = effect.family.rest(held, values)
+                self.memory[effect.name] = family.rest(held, values)
+                continue
+            for j in map(names.index, effect.site.targets):
+                if isinstance(family, InputFamily):
+                    u[j] = family.effect(u[j], 0.0, values)
+                else:
+                    self.memory[f"{effect.name} {j}"] = (u[j],) * family.depth(values, self.fine)
         self.queues = [[u[j]] * (int(whole) + 1) for j, (whole, _) in enumerate(self.late)]
 
     def received(self, u: Array, t: float) -> Array:
         """Return what the actuators deliver over a fine step."""
-        model, out = self.truth.model, u.copy()
-        for index, (effect, values) in enumerate(self.truth.effects):
-            family = effect.family
-            for target in effect.site.targets:
-                if not isinstance(family, InputFamily | MemoryFamily):
-                    continue
-                j = model.input_names.index(target)
+        out = u.copy()
+        for effect, family, values in self.of(InputFamily, MemoryFamily):
+            for j in map(self.model.input_names.index, effect.site.targets):
                 if isinstance(family, InputFamily):
                     out[j] = family.effect(out[j], t, values)
-                else:
-                    key = f"{index}{target}"
-                    z = self.memory[key]
-                    out[j], self.memory[key] = family.advance(out[j], z, values, self.fine)
+                    continue
+                z = self.memory[key := f"{effect.name} {j}"]
+                out[j], self.memory[key] = family.advance(out[j], z, values, self.fine)
         for actuator in self.truth.actuators:
             out = actuator(out, self.own_state, t, self.fine)
         for j, queue in enumerate(self.queues):  # mean of the delayed input over a fine step
@@ -170,41 +168,31 @@ class _Run:
     def rates(self, x: Array, u: Array, t: float) -> Array:
         """Return ds/dt of the real system over ground, in a moving medium if there is one."""
         s = Named("state", self.names, list(x))
-        for effect, values in self.truth.effects:
-            if isinstance(effect.family, MediumFamily):
-                seen = through_it(effect, s, values)
-                own = self.through_the_medium(np.array(list(seen.values())), u, t)
-                ahead = [
-                    value + TINY * rate for value, rate in zip(seen.values(), own, strict=True)
-                ]
-                after = over_ground(effect, Named("state", self.names, ahead), values, TINY)
-                return (np.array([after[n] for n in self.names]) - x) / TINY
+        for effect, _, values in self.of(MediumFamily):
+            seen = np.array(list(through_it(effect, s, values).values()))
+            ahead = [*(seen + TINY * self.through_the_medium(seen, u, t))]
+            after = over_ground(effect, Named("state", self.names, ahead), values, TINY)
+            return (np.array([after[n] for n in self.names]) - x) / TINY
         return self.through_the_medium(x, u, t)
 
     def through_the_medium(self, x: Array, u: Array, t: float) -> Array:
         """Return ds/dt of states through the medium, with all other effects."""
-        model = self.truth.model
-        s, a = Named("state", self.names, list(x)), Named("input", model.input_names, list(u))
-        assert model.derivative is not None
-        own = dict(model.derivative(s, a, self.p))
-        for effect, values in self.truth.effects:
-            if isinstance(effect.family, LossFamily):
-                tau = coupled(effect.site)[0]
-                more = model.derivative(s, _with(a, tau, a[tau] + NUDGE), self.p)
-                w, rate, then = (speed(effect, one) for one in (s, own, more))
-                gain = (then - rate) / NUDGE
-                c = {**values, **self.memory[effect.name]}
-                lost = effect.family.torque(w, rate, gain, a[tau], c)
-                a = _with(a, tau, a[tau] - lost)
-                own = dict(model.derivative(s, a, self.p))
+        derivative, inputs = self.model.derivative, self.model.input_names
+        s, a = Named("state", self.names, list(x)), Named("input", inputs, list(u))
+        assert derivative is not None
+        own = dict(derivative(s, a, self.p))
+        for effect, family, values in self.of(LossFamily):
+            tau = coupled(effect.site)[0]
+            more = derivative(s, _with(a, tau, a[tau] + NUDGE), self.p)
+            w, rate, then = (speed(effect, one) for one in (s, own, more))
+            c = {**values, **self.memory[effect.name]}
+            lost = family.torque(w, rate, (then - rate) / NUDGE, a[tau], c)
+            a = _with(a, tau, a[tau] - lost)
+            own = dict(derivative(s, a, self.p))
+        added = [f.rate(s, a, own, t, values, e.site) for e, f, values in self.of(RateFamily)]
         total = {n: float(own[n]) for n in self.names}
-        for effect, values in self.truth.effects:
-            if isinstance(effect.family, RateFamily):
-                added = effect.family.rate(s, a, own, t, values, effect.site)
-                for n, value in added.items():
-                    total[n] += float(value)
-        for extra in self.truth.rates:
-            for n, value in extra(s, a, t, own).items():
+        for one in (*added, *(extra(s, a, t, own) for extra in self.truth.rates)):
+            for n, value in one.items():
                 total[n] += float(value)
         return np.array([total[n] for n in self.names])
 
@@ -223,12 +211,11 @@ class _Run:
 
     def remembered(self, x: Array, after: Array, u: Array, dt: float) -> dict[str, Any]:
         """Return the memories of losses after a motion from x to `after` (n,) with u (m,)."""
-        found, inputs = dict[str, Any](), self.truth.model.input_names
-        for effect, values in self.truth.effects:
-            if isinstance(effect.family, LossFamily):
-                w, end = (speed(effect, dict(zip(self.names, s, strict=True))) for s in (x, after))
-                sent, c = u[inputs.index(coupled(effect.site)[0])], self.memory[effect.name]
-                found[effect.name] = effect.family.later(w, end, 0.0, sent, {**values, **c}, dt)
+        found, inputs = dict[str, Any](), self.model.input_names
+        for effect, family, values in self.of(LossFamily):
+            w, end = (speed(effect, dict(zip(self.names, s, strict=True))) for s in (x, after))
+            sent, c = u[inputs.index(coupled(effect.site)[0])], self.memory[effect.name]
+            found[effect.name] = family.later(w, end, 0.0, sent, {**values, **c}, dt)
         return found
 
     def tie(self, t: float) -> None:
@@ -251,8 +238,7 @@ class _Run:
             self.gust = phi * self.gust + kick
             self.x = self.x + self.gust * scale * dt / np.sqrt(2 * noise.tau)
             return
-        w = self._draw(len(scale))
-        self.x = self.x + scale * np.sqrt(dt) * w
+        self.x = self.x + scale * np.sqrt(dt) * self._draw(len(scale))
 
     def _draw(self, count: int) -> Array:
         if self.truth.disturbance.kind == "heavy":
@@ -263,13 +249,13 @@ class _Run:
         """Return the logged state at this moment."""
         noise = self.truth.disturbance
         y = self.x.copy()
-        for effect, values in self.truth.effects:
-            for i in [self.names.index(n) for n in effect.site.targets if n in self.names]:
-                if isinstance(effect.family, SensorFamily):
-                    y[i] = effect.family.measure(y[i], values)
-                elif isinstance(effect.family, SensorDelayFamily):
+        for effect, family, values in self.of(SensorFamily, SensorDelayFamily, SensorLagFamily):
+            for i in map(self.names.index, effect.site.targets):
+                if isinstance(family, SensorFamily):
+                    y[i] = family.measure(y[i], values)
+                elif isinstance(family, SensorDelayFamily):
                     y[i] += self._old(i, values["d"]) - self.x[i]
-                elif isinstance(effect.family, SensorLagFamily):
+                else:
                     y[i] += self._filtered(i, values["tau"]) - self.x[i]
         scale = np.array([noise.measurement.get(n, 0.0) for n in self.names])
         v = self._draw(len(scale))

@@ -157,11 +157,7 @@ def raised_at(error: BaseException, function: Any) -> str:
 
 
 def check_names(values: Any, states: Sequence[str], function: Any) -> None:
-    """Whether a function returned a dict of exactly the states.
-
-    Raises:
-        GroundedError: naming the function's file and line, what is missing and what is too much.
-    """
+    """Whether a function returned a dict of exactly the states."""
     if not isinstance(values, Mapping):
         kind = type(values).__name__
         raise refused("model.returns", where(function), type=kind, states=tuple(states))

@@ -65,14 +65,9 @@ def integrated(
     integrator: str,
     count: int = 1,
 ) -> list[Any]:
-    """The values x after dt, by equal steps: numbers, arrays, expressions alike.
+    """The values x after dt, by `count` equal steps: numbers, arrays, expressions alike.
 
-    Args:
-        rate: the values' rates at such values.
-        x: the values at the start.
-        dt: the whole time [s].
-        integrator: its name in STAGES.
-        count: number of steps.
+    `rate` are the values' rates at such values, `integrator` a name in STAGES.
     """
     h = dt / count if count > 1 else dt
     for _ in range(count):

@@ -206,13 +206,7 @@ def _delay(site: Site) -> tuple[Quantity, ...]:
 
 
 def delay_again(effect: Effect, known: float, room: float) -> Effect:
-    """Return an effect that lengthens or shortens a delay that the model already has.
-
-    Args:
-        effect: the delay at its site.
-        known: the delay that the model has [s].
-        room: the most by which it may be shortened [s].
-    """
+    """Return a delay that changes the one `known` to the model, shortened by at most `room` [s]."""
     dt, (d,) = effect.site.scales.dt, effect.quantities
     less = min(known, room)
     near = [part * dt for part in NEARBY if part * dt < d.high]

@@ -94,14 +94,9 @@ def speed_weights(model: Model, target: str) -> Mapping[str, float]:
 
 
 def weights_at(model: Model, target: str, given: Mapping[str, float]) -> Mapping[str, float]:
-    """Return `speed_weights` of a model with other parameters.
+    """Return `speed_weights` of a model with other parameters, by name, also of effects.
 
     They are those of the model itself where its slopes tell none at these parameters.
-
-    Args:
-        model: the model of the loss; adopted effects around it do not count.
-        target: of the loss, `tau<-w` or `tau<-w+w2`.
-        given: parameters by name, also of effects.
     """
     found = speed_weights(model, target)
     if len(found) < 2:
@@ -121,10 +116,7 @@ def weights_at(model: Model, target: str, given: Mapping[str, float]) -> Mapping
 def speed(effect: Effect, values: Any, weights: Mapping[str, Any] | None = None) -> Any:
     """Return the speed that a loss depends on, given values by state, or their changes.
 
-    Args:
-        effect: the loss.
-        values: by state.
-        weights: of the velocities; None: those of the effect's model (`speed_weights`).
+    `weights` of the velocities; None: those of the effect's model (`speed_weights`).
     """
     total: Any = 0.0
     if weights is None:

@@ -176,15 +176,9 @@ def scanned_time(
 ) -> tuple[Quantity, ...]:
     """Return a time that is scanned as far as the model and the log allow.
 
-    What the model itself answers slowly may be late or slow by as much. Of more than a quarter of
-    a trial, too little is left in it.
-
-    Args:
-        site: where the effect acts.
-        name: of the quantity.
-        grid: usual values [s], ascending; continued at the ratio of the last two.
-        places: number of independent values among these.
-        reach: how far beyond its grid an estimate may lie, as a factor.
+    What the model itself answers slowly may be late or slow by as much. Of more than a quarter of a
+    trial, too little is left in it. `grid` [s] is continued at the ratio of its last two values, of
+    which `places` are independent; an estimate may lie beyond it by the factor `reach`.
     """
     far, ratio = min(site.scales.slowest, site.scales.duration / 4), grid[-1] / grid[-2]
     more = max(int(np.log(max(far / grid[-1], 1.0)) / np.log(ratio)), 0)
@@ -390,11 +384,7 @@ class Effect:
         return float(np.prod([max(q.places, 1.0) for q in self.free]))
 
     def complete(self, values: Mapping[str, float]) -> Mapping[str, float]:
-        """Return the values of all quantities, given ones and constants.
-
-        Raises:
-            GroundedError: if a name is not a quantity, or a quantity has no value.
-        """
+        """Return the values of all quantities, given ones and constants."""
         names = [q.name for q in self.quantities]
         for name in values:
             known("quantity", [name], names, f"effect '{self.name}'")

@@ -77,10 +77,7 @@ def has_viscous(model: Model, target: str) -> bool:
 
 
 def strongest(site: Site) -> float:
-    """Return an upper bound of dry friction, twice the largest input seen.
-
-    It is infinite for an input that is always zero (a joint without a motor).
-    """
+    """Return twice the largest input seen, which bounds dry friction; infinite without a motor."""
     tau, _ = coupled(site)
     return 2 * site.scales.peak(tau) if site.scales.moves(tau) else np.inf
 
@@ -120,9 +117,8 @@ def _pushed(model: Model, f_u: Array, tau: str, velocities: Sequence[str]) -> st
 def _coupled(model: Model, inputs: Sequence[str]) -> dict[str, str | None]:
     """Return the velocity driven by inputs of any unit that also move a second velocity.
 
-    Velocities are those of a position (q' = w), tested over the range of all positions. Diagonals
-    of an inverse inertia matrix are positive for all q, so an input whose direction changes with
-    the position (a tilted thrust) is not a joint's motor.
+    Diagonals of an inverse inertia matrix are positive for all positions q' = w: an input whose
+    direction changes with them (a tilted thrust) is not a joint's motor.
     """
     axes = places.integrated(model)
     velocities = list(dict.fromkeys(w for w, _ in axes.values()))

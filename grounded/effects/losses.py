@@ -182,15 +182,7 @@ def _beside(
 def ahead(
     pairs: Pairs, at: Loads, losses: Sequence[Any], dt: Any, moved: Integrated
 ) -> dict[str, Any]:
-    """Return what positions gain in a step over a step with the mean losses held.
-
-    Args:
-        pairs: effects with their quantities.
-        at: the quantities from which the losses were solved.
-        losses: mean losses over the step.
-        dt: the step [s].
-        moved: the positions among the states, see `places.integrated`.
-    """
+    """Return what positions (`moved`) gain in a step over a step with the mean losses held."""
     half = at._replace(
         free=[0.5 * (start + end) for start, end in zip(at.w, at.free, strict=True)],
         gain=[[0.5 * by for by in row] for row in at.gain],
@@ -222,7 +214,7 @@ def _compiled(
 ) -> list[Any] | None:
     """Solve the losses of arrays with compiled code; None for other types, or without a compiler.
 
-    found: current mean losses, of which each is solved once beside the others; empty: solve all.
+    `found`: current mean losses, beside which each is solved once; empty: solve all.
     """
     free = at.free[0]
     if not (isinstance(free, np.ndarray) and free.dtype == np.float64):
@@ -245,13 +237,7 @@ def _compiled(
 
 @cache
 def _kernel(losses: Losses, names: tuple[tuple[str, ...], ...], known: bool) -> System | None:
-    """Compile the losses of many rows, as a step function of the speeds; None if that fails.
-
-    Args:
-        losses: the loss function of each pair.
-        names: names of each pair's quantities.
-        known: whether current mean losses are given.
-    """
+    """Compile the losses of many rows, as a step of the speeds; None if that fails."""
     pairs = range(len(losses))
     quantities = [[f"{name}_{i}" for name in own] for i, own in enumerate(names)]
     gains = [[f"gain_{i}_{j}" for j in pairs] for i in pairs]

@@ -108,10 +108,7 @@ def renamed(model: Model) -> dict[str, str]:
 
 
 def _felt(model: Model) -> tuple[Array, Array]:
-    """Return what a moving medium adds to the rates of (u, v), and its velocity in their axes.
-
-    (S, 2) each, at S samples; (0, 2) if the model has no such velocities.
-    """
+    """Return what a moving medium adds to the rates of (u, v), and its velocity there, (S, 2)."""
     if not (found := places.body_velocity(model)):
         return np.zeros((0, 2)), np.zeros((0, 2))
     effect = current.at(Site(model, found, Scales()))

@@ -108,16 +108,11 @@ def late_inputs(inputs: Array, held: Array, latency: Array, dt: float) -> Array:
 def memory_of(wrapped: Model, base: Model, trial: Trial, latency: Array | None = None) -> Array:
     """Return the memory states along a recorded trial, (T + 1, wrapped.n - base.n).
 
-    They start at `memory_start` and follow the logged states and the received commands. True values
-    behind late or filtered logs would drift away from these where they are integrals (a heading, a
-    place), since a crude model misses their rates. So they follow their logs: what the model misses
-    of a log moves its true values by FOLLOWS of it, as an observer does (Luenberger 1964).
-
-    Args:
-        wrapped: the model with memory.
-        base: the model without, whose states the trial has.
-        trial: the trial; without `start_inputs`, 0 was held before it.
-        latency: transport delay of the inputs (m,) [s], which acts before the memory; None: none.
+    They start at `memory_start` and follow the logged states and the received commands, which come
+    by `latency` (m,) [s] late. True values behind late or filtered logs would drift away from these
+    where they are integrals (a heading, a place), since a crude model misses their rates. So they
+    follow their logs: what the model misses of a log moves its true values by FOLLOWS of it, as an
+    observer does (Luenberger 1964).
     """
     inputs = trial.inputs
     if latency is not None:

@@ -66,9 +66,7 @@ def _coupling(site: Site) -> tuple[Quantity, ...]:
 def _periodic(site: Site) -> tuple[Quantity, ...]:
     """Return a wave's quantities, its frequency scanned in steps of half a bin.
 
-    The grid goes from `PERIODS` per trial to a fifth of the sampling rate. A slower wave can't be
-    distinguished from a drift: half a cosine of 54 s fits a battery that sags over 30 s. An adopted
-    wave may be slower, as it was found in other data.
+    A slower wave than PERIODS a trial can't be told from a drift. An adopted one may be slower.
     """
     scales = site.scales
     lowest = PERIODS / scales.duration
@@ -191,8 +189,7 @@ HALTS = 2.0  # most that friction may take off in a control step, in units of th
 def _least(site: Site, power: int) -> float:
     """Return the lower bound of a friction coefficient, minus the damping of the model.
 
-    In units of speed^(1 - power) per second; power 1 is viscous friction. A negative coefficient
-    means less friction than modelled.
+    In units of speed^(1 - power) per second; power 1 is viscous friction.
     """
     model, name = site.model, site.target
     if not site.scales.moves(name):

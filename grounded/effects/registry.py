@@ -93,20 +93,12 @@ class Library:
         return Library((*self.families, *more))
 
     def without(self, names: Iterable[str]) -> Library:
-        """Return a library without these families.
-
-        Raises:
-            GroundedError: if a name is not in it.
-        """
+        """Return a library without these families."""
         gone = [self.family(name) for name in set(names)]
         return Library(tuple(family for family in self.families if family not in gone))
 
     def family(self, name: str) -> Family:
-        """Return the family of that name.
-
-        Raises:
-            GroundedError: if there is none.
-        """
+        """Return the family of that name."""
         for family in (
             *self.families,
             rate.correction,
@@ -117,11 +109,7 @@ class Library:
         raise unknown("effect family", name, known)
 
     def effect(self, name: str, model: Model, scales: Scales | None = None) -> Effect:
-        """Return the effect `family:target` at a model; of joint inputs, any several will do.
-
-        Raises:
-            GroundedError: if the family is unknown or does not apply there.
-        """
+        """Return the effect `family:target` at a model; of joint inputs, any several will do."""
         family_name, _, target = name.partition(":")
         family = self.family(family_name)
         known = list(family.targets(model))
@@ -187,12 +175,7 @@ PARAMETER_FACTOR = 1.3  # factor on the parameters for the second comparison
 
 
 def aliases(model: Model, idle: Iterable[str] = ()) -> dict[str, str]:
-    """Return the names of rate effects that are equivalent to another effect: {dropped: kept}.
-
-    Args:
-        model: the model.
-        idle: states without dynamics (carried along, or set outright), which are not compared.
-    """
+    """Return {dropped: kept} of equivalent rate effects; `idle` states have no dynamics."""
     rng, n = np.random.default_rng(0), model.n
     x, u = rng.uniform(-1, 1, (SAMPLES, n)), rng.uniform(-1, 1, (SAMPLES, model.m))
     kept = [i for i, name in enumerate(model.state_names) if name not in set(idle)]

@@ -85,14 +85,8 @@ def moved_model(model: Model) -> Model:
 def logged(model: Model, x: Array, after: Array, p: Array, dt: float) -> Array:
     """Return states (..., n) after a step with the delayed logs and their memory updated.
 
-    The result is linear in x and `after` together, so that slopes can be passed instead of states.
-
-    Args:
-        model: the model, whose logs may be delayed.
-        x: states at the start of the step (..., n).
-        after: states at its end (..., n), correct in the true values.
-        p: the model's parameters (k,), or per row (N, k).
-        dt: the step [s].
+    The result is linear in x (..., n) and `after`, which is correct in the true values, so that
+    slopes can be passed instead of states. The parameters p are (k,), or (N, k) per row.
     """
     found = behind_logs(model)
     if found is None:

@@ -38,14 +38,7 @@ def _lag(site: Site) -> tuple[Quantity, ...]:
 
 
 def lagging(behind: Any, moved: Any, tau: Any, dt: Any) -> Any:
-    """Return y - s of a filtered sensor after a step in which its state s moved at constant rate.
-
-    Args:
-        behind: y - s before the step.
-        moved: change of s in the step.
-        tau: time constant [s].
-        dt: step [s].
-    """
+    """Return y - s of a filtered sensor after a step of dt in which its state s moved evenly."""
     tau = np.maximum(tau, 1e-6)
     follows = moved * tau / dt
     return (behind + follows) * np.exp(-dt / tau) - follows

@@ -74,9 +74,6 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
         effect: built for the model that it will change (`Library.effect`).
         values: the effect's quantities; fixed ones may be omitted.
         dt: control step [s], which sets the length of a queue.
-
-    Raises:
-        GroundedError: if a quantity is unknown or missing.
     """
     model, family = effect.site.model, effect.family
     whole = effect.complete(values)
@@ -125,15 +122,10 @@ def wrap(effect: Effect, values: Mapping[str, float], dt: float) -> Model:
 
 
 def late_by(model: Model, late: Mapping[str, float], dt: float) -> Model:
-    """Return a model whose inputs arrive a part of a step late.
+    """Return a model whose inputs arrive `late` by a part of a step: {input: time below dt [s]}.
 
     The step is made in parts, before and after each of them arrives. So what bends an input (a dead
     zone) or has a memory (a lag) gets what was sent, not a mean of two commands.
-
-    Args:
-        model: with the effects on its inputs.
-        late: by input, more than 0 and less than `dt` [s].
-        dt: control step [s].
     """
     if not late:
         return model
@@ -145,8 +137,7 @@ def late_by(model: Model, late: Mapping[str, float], dt: float) -> Model:
 def _inside(outside: Around, effect: Effect, values: Mapping[str, float], dt: float) -> Model:
     """Return a model with an effect on the motion inside its outermost effect.
 
-    For example, a friction acts on the true velocity, not on its delayed log, and a hull's drag
-    acts on the velocity through the water.
+    A friction acts on the true velocity, not on its delayed log; a hull's drag through the water.
     """
     model, outer = effect.site.model, outside.effects[-1]
     inner = outside.inner
@@ -165,8 +156,7 @@ ADOPTED_SPREAD = 0.5  # prior standard deviation of an adopted quantity, relativ
 def _param(quantity: Quantity, value: float, constant_at_zero: bool) -> Param:
     """Return a quantity as a parameter of the wrapped model.
 
-    A quantity at 0 beside others that are not is a part that the data did not show (the other side
-    of an input that was always positive), and becomes a constant.
+    One that is 0 beside others was not shown by the data, and becomes a constant.
     """
     fixed = quantity.fixed or (value == 0 and constant_at_zero)
     if fixed:
@@ -299,8 +289,7 @@ def _rate_step(effect: Effect, whole: Values, dt: float) -> tuple[Step, dict[str
 def _joint_step(model: Model, effects: tuple[Effect, ...]) -> Step:
     """Return a step with all rates, each of which sees the model's own rate without the others.
 
-    These are the equations of the diagnosis, `Predictor.advance`. In nested steps, an effect would
-    take another one's rate for the model's own.
+    These are the equations of the diagnosis, `Predictor.advance`.
     """
     base, instant, clocks = plain_step(model), _instant(model), _clocks(effects)
     bare = getattr(model.step, "bare", model)

@@ -68,9 +68,6 @@ def run(
         first_seed: first seed of the approximate models.
         engine: where the jobs run, see `run_jobs`.
         progress: see `run_jobs`.
-
-    Raises:
-        GroundedError: if more than four of five models are discarded.
     """
     found: list[Row] = []
     while missing := count - sum(not row["discarded"] for row in found):

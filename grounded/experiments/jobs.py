@@ -41,9 +41,6 @@ def run_jobs(
         cases: the arguments by name, one job each.
         engine: where the jobs run; None: in this process.
         progress: called with the number of jobs done and the total.
-
-    Raises:
-        GroundedError: if a worker dies.
     """
     rows, results = [*enumerate(cases)], dict[int, R]()
     tell = progress or (lambda done, total: None)

@@ -272,7 +272,7 @@ def test_the_simulator_is_the_crude_model_but_for_what_is_withheld(system, built
     def after(**part):
         kinds = {kind: part.get(kind, {}) for kind in ("friction", "armature", "lag")}
         true = dict(zip(model.param_names, model.values, strict=True)) | part.get("true", {})
-        plant, at = Mechanism(built, kinds | {"true": true}).plant(0.005), x
+        plant, at = Mechanism(built, kinds | {"true": true}, {}, 0.005), x
         for _ in range(10):
             at = plant.advance(at, u)
         return at

@@ -63,12 +63,7 @@ def gather_rows(
 ) -> None:
     """Rows first .. first + W - 1 of (count, size) arrays to [size][W], the last row repeated.
 
-    Args:
-        f: where to write.
-        arrays: (address, size, destination) of each.
-        first: number of the first row.
-        count: number of rows.
-        width: W.
+    `arrays`: (address, size, destination) of each.
     """
     last, index = f.integer("sub", count, 1), list[str]()
     for lane in range(width):

@@ -22,16 +22,10 @@ def module_text(
     width: int,
     derivatives: bool = True,
 ) -> str:
-    """LLVM IR of a module, for vectors of `width` doubles.
+    """LLVM IR of a module, for vectors of `width` doubles; without derivatives, steps and rollouts.
 
-    Args:
-        trace: the traced model.
-        kind: of the user's function.
-        integrator: of a derivative.
-        which: "batch" (step and linearise), "full" (with the parameters), or a layout of z:
-            rollout and, for few enough inputs, sweep and descent about it.
-        width: doubles in the widest vector of the machine.
-        derivatives: else steps and rollouts alone.
+    `which`: "batch" (step and linearise), "full" (with the parameters), or a layout of z: rollout
+    and, for few enough inputs, sweep and descent about it.
     """
     n, m, k = trace.sizes
     more = k if which == "full" else 0

@@ -154,11 +154,7 @@ class CompiledSystem(System):
         return self.original.evaluate(x, u, p, dt, smoothing)
 
     def trace(self, p: Array, dt: float) -> Trace:
-        """The trace that holds for these parameters.
-
-        Raises:
-            GroundedError: when the branch they take can't be traced.
-        """
+        """The trace that holds for these parameters."""
         for known in self._traces:
             if known.holds(p, dt):
                 return known

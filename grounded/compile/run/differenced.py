@@ -68,9 +68,6 @@ class DifferencedSystem(System):
 
         Not those that are differences themselves (`Stepper.differenced`).
         At a kink, such as a limit of an input, those of either side or between them are right.
-
-        Raises:
-            GroundedError: where they differ by more than a hundredth of the largest.
         """
         own = self.signature.jacobian
         if own is None or getattr(self.signature.function, "differenced", False):

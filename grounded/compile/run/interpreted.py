@@ -187,13 +187,7 @@ class System(ABC):
         return self.differences(at, width)
 
     def differences(self, at: Samples, width: int, relative: float = RELATIVE_STEP) -> Array:
-        """Central differences of `step`, like `jacobian`.
-
-        Args:
-            at: the samples.
-            width: see `jacobian`.
-            relative: their step, relative to a state or an input, or 1, and to a parameter.
-        """
+        """Central differences of `step`, like `jacobian`; steps `relative` to a value or 1."""
         x, u, p, dt, eps, limits = at
         d = self.n + self.m
         both, high = np.concatenate([x, u], axis=1), np.full(d, np.inf)

@@ -110,12 +110,9 @@ class Library:
 
 
 def library(key: str, write: Callable[[], str], names: Sequence[str]) -> Library:
-    """The functions of a module, loaded from the cache or compiled now.
+    """The functions `names` of a module, loaded from the cache or compiled now from `write`.
 
-    Args:
-        key: identifies the text; the machine and llvmlite's version are added here.
-        write: returns the IR text, called only when it has to be compiled.
-        names: functions wanted, each `(words: ptr) -> i64 or void`.
+    `key` identifies the text; the machine and llvmlite's version are added here.
     """
     with _LOCK:  # LLVM's global context is not thread safe
         digest = hashlib.sha256(f"{key} {_fits()}".encode()).hexdigest()

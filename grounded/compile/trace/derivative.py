@@ -24,13 +24,7 @@ Rule = Callable[[Graph, int, tuple[int, ...]], tuple[int, ...]]
 def jacobian(
     graph: Graph, outputs: Sequence[int], variables: Sequence[int]
 ) -> list[dict[int, int]]:
-    """Derivatives d outputs / d variables: for each output, the nodes of its non-zero derivatives.
-
-    Args:
-        graph: grows by the derivatives' nodes.
-        outputs: node numbers.
-        variables: node numbers of leaves.
-    """
+    """For each output, the nodes of its non-zero derivatives by variables, leaves of the graph."""
     one = graph.const(1.0)
     tangents: dict[int, dict[int, int]] = {v: {v: one} for v in variables}
     for i in graph.live(outputs):

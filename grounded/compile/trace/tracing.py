@@ -47,11 +47,7 @@ class Trace:
         return [self.graph.leaf(*letter) for letter in letters[:width]]
 
     def entries(self, width: int) -> list[tuple[int, int, int]]:
-        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p.
-
-        Raises:
-            TooLong: when they are more operations than can be compiled.
-        """
+        """(row, column, node) of the non-zero derivatives by the first `width` of x, u, p."""
         variables = self._variables(width)
         column = {v: c for c, v in enumerate(variables)}
         rows = jacobian(self.graph, self.outputs, variables)
@@ -67,13 +63,7 @@ class Trace:
 def trace(signature: Signature, p: Array | None, dt: float) -> Trace | str:
     """The trace, or why there is none, naming file and line.
 
-    Args:
-        signature: the function and its names.
-        p: parameter values (k,) that decide an `if` on parameters; None: every `if` is taken.
-        dt: control step [s], which may be part of such a decision.
-
-    Raises:
-        GroundedError: for what is wrong with the function on any path: names, a complex result.
+    Parameter values p (k,) and dt decide an `if` on parameters; None: every `if` is taken.
     """
     graph, guards = Graph(MAX_NODES), []
 
