@@ -111,7 +111,8 @@ def _case(
     dt = 1.0 / float(rng.choice(system.rates))
     duration = float(rng.uniform(*system.duration))
     drawn = NOISE_KINDS[index % 3] if kind == "none" else rng.choice(NOISE_KINDS, p=[0.8, 0.1, 0.1])
-    times, count = np.arange(round(duration / dt)) * dt, int(rng.integers(3, 9))
+    times = np.arange(round(duration / dt), dtype=float) * dt
+    count = int(rng.integers(3, 9))
     level, roughness = float(rng.choice([0.5, 1.0, 2.0])), float(rng.choice([0.5, 1.0, 3.0]))
     same_task = bool(rng.random() < 0.3)
     if (error := param_error) is None:
