@@ -43,19 +43,8 @@ def encoded_candidate(
 ) -> tuple[bytes, dict[str, str]]:
     """Return a candidate as the bytes of a file, and the metadata that `read_candidate` returns.
 
-    Equal arguments give equal bytes.
-
-    Args:
-        policy: what the robot runs, H steps.
-        predicted_states: (H+1, n).
-        predicted_inputs: (H, m).
-        meta: entries of the metadata record besides the reserved ones.
-        state_units: name -> unit; "1" where missing.
-        input_units: the same for the inputs.
-
-    Raises:
-        GroundedError: if the policy holds a number that is not finite, a shape is wrong, or an
-            entry of `meta` is reserved.
+    Equal arguments give equal bytes. The prediction has states (H+1, n) and inputs (H, m); `meta`
+    holds the entries besides the reserved ones; units are "1" where missing.
     """
     _refuse_faulty(policy)
     H, n, m = policy.horizon, len(policy.state_names), len(policy.input_names)
@@ -96,18 +85,10 @@ def encoded_candidate(
 def read_candidate(
     source: str | Path | bytes, name: str = "candidate"
 ) -> tuple[Policy, Array, Array, dict[str, str]]:
-    """Read a candidate file.
+    """Read a candidate file, by its path, or its bytes and a name for messages.
 
-    Args:
-        source: the file's path, or its bytes.
-        name: name of the file in messages, if `source` is bytes.
-
-    Returns:
-        The policy, the predicted states (H+1, n), the predicted inputs (H, m) and the metadata.
-        The metadata of a file written by 0.1 has no `sha256`, so its contents are not verified.
-
-    Raises:
-        GroundedError: if the file is damaged, was rewritten, or is not a candidate of grounded's.
+    Returns the policy, the predicted states (H+1, n) and inputs (H, m), and the metadata. That of
+    a file written by 0.1 has no `sha256`, so its contents are not verified.
     """
     own = read_own(source, name, CANDIDATE)
     states, inputs = own.names("states"), own.names("inputs")
@@ -143,11 +124,7 @@ def read_candidate(
 
 
 def read_policy(path: str | Path) -> tuple[Policy, str]:
-    """Read a candidate's policy and task hash; `grounded.policy.load` uses it for .mcap files.
-
-    Raises:
-        GroundedError: as `read_candidate`.
-    """
+    """Read a candidate's policy and task hash; `grounded.policy.load` uses it for .mcap files."""
     policy, _, _, meta = read_candidate(path, str(path))
     return policy, meta.get("task", "")
 

@@ -155,16 +155,8 @@ def trial_bytes(
 ) -> bytes:
     """Return a trial as the bytes of a file; equal arguments give equal bytes.
 
-    Args:
-        trial: states (T+1, n) and inputs (T, m).
-        meta: entries of the metadata record besides the reserved ones.
-        policy: the bytes of the file of the candidate that was run.
-        state_units: name -> unit; "1" where missing.
-        input_units: the same for the inputs.
-        start_ns: the absolute time of t = 0 [ns].
-
-    Raises:
-        GroundedError: if an entry of `meta` is reserved.
+    `meta` holds the entries besides the reserved ones, `policy` is the file of the candidate that
+    was run, units are "1" where missing, and `start_ns` is the absolute time of t = 0 [ns].
     """
     stream = io.BytesIO()
     with TrialWriter(

@@ -105,14 +105,11 @@ def to_adopt(workspace: Folder, diagnosis: Diagnosis) -> NextCommand | None:
 
     # What is new, but what the user has undone; late sensors are adopted with it, or alone.
     table = workspace.config.model
-    new, undone = (
-        diagnosis.open(listed(table.effects), table.params),
-        {*_readable(workspace).undone},
-    )
+    new, undone = diagnosis.open(listed(table.effects), table.params), _readable(workspace).undone
     late = tuple(name for name in late_open(workspace, diagnosis) if name not in undone)
     alone = NextCommand("adopt", late) if late else None
     claimed = diagnosis.kind in ("effect", "several") and not diagnosis.doubt
-    if not claimed or {*new} <= undone:
+    if not claimed or {*new} <= {*undone}:
         return alone
 
     # A sign is flipped before anything is adopted, as the diagnosis says.
