@@ -142,6 +142,6 @@ def _task(model: Model, dt: float) -> Task:
         high=high,
     )
     with suppress(GroundedError):  # a faulty model is reported when planning
-        if (still := resting(task, np.zeros(n, np.bool_))) is not None:
-            return replace(task, past=np.array([float(f"{u:.6g}") for u in still[n:]]))
+        if (held := resting(task)) is not None:
+            return replace(task, past=np.array([float(f"{u:.6g}") for u in held]))
     return task

@@ -117,8 +117,8 @@ def _bounded(workspace: Folder) -> Task:
     assert task.safety_low is not None and task.safety_high is not None
     if not np.isfinite([*task.safety_low, *task.safety_high]).any():
         raise GroundedError(found("plan.no_drive", state=task.model.state_names[0]))
-    stands = resting(task, np.zeros(task.model.n, bool), planner.loose)
-    return task if stands is None else replace(task, past=stands[task.model.n :])
+    held = resting(task, planner.loose)
+    return task if held is None else replace(task, past=held)
 
 
 def _as_known(workspace: Folder, model: Model) -> Model:

@@ -16,7 +16,7 @@ import numpy as np
 
 from grounded.errors import GroundedError
 from grounded.frozen import Array
-from grounded.model import Model, is_clock
+from grounded.model import Model
 from grounded.places import rate_states
 from grounded.search.first_guess import trim
 from grounded.search.noise import sensor_noise
@@ -106,34 +106,25 @@ STILL = 1e-9  # motion in a step, in a state's unit, that counts as none
 DEPENDS = 1e-9  # change of a step per unit of a state, above which the physics depends on it
 
 
-def resting(task: Task, free: NDArray[np.bool_], loose: Task | None = None) -> Array | None:
-    """Find states and inputs (n + m,) inside the limits under which the robot rests at its start.
+def resting(task: Task, loose: Task | None = None) -> Array | None:
+    """Return the inputs (m,) inside the limits under which the robot rests at its start.
 
-    None if it rests under the input held before already, or if no input holds it because the start
-    is in motion. The clock states of effects that grow with time are ignored: they always move.
-
-    Args:
-        task: the task with the start.
-        free: (n,), states that may differ from the start.
-        loose: the task with softened dry friction, used for the search: with sticking friction the
-            robot would rest under almost any input.
+    None if it rests under those held before already, or if the start is in motion. `loose` is the
+    task with softened dry friction: with sticking friction it would rest under almost any input.
     """
-    clocks = free & [is_clock(name) for name in task.model.state_names]
-    free, away = free & ~clocks, np.abs(moved_at_start(task, task.past))[~clocks].max()
+    away = np.abs(moved_at_start(task, task.past)).max()
     if away <= STILL:
         return None
-    still = np.tile(task.start, (2, 1))
-    still[1, clocks] += task.dt
+    still, every = np.tile(task.start, (2, 1)), np.ones(task.model.n, dtype=bool)
     middle, inside = task.past.copy(), np.isfinite(task.high - task.low)
     middle[inside] = 0.5 * (task.low[inside] + task.high[inside])
     for first in [*(task.past + move for move in BEGUN), middle]:
-        x, u = still[0], np.clip(first, task.low, task.high)
+        u = np.clip(first, task.low, task.high)
         for one in (loose or task, replace(task, smoothing=0.0)):  # a kink at 0, once near the rest
             one = replace(one, target=still, input_target=None, past=u)
-            x, u = (row[0] for row in trim(one, np.stack([x, still[1]]), ~free))
-            moved = np.abs(moved_at_start(replace(task, start=x), u))[~clocks]
-            if (moved <= AT_REST_SHARE * away).all():
-                return np.append(x, u)
+            u = trim(one, still, every)[1][0]
+            if (np.abs(moved_at_start(task, u)) <= AT_REST_SHARE * away).all():
+                return u
     return None
 
 
