@@ -122,7 +122,7 @@ def resting(task: Task, loose: Task | None = None) -> Array | None:
         u = np.clip(first, task.low, task.high)
         for one in (loose or task, replace(task, smoothing=0.0)):  # a kink at 0, once near the rest
             one = replace(one, target=still, input_target=None, past=u)
-            u = trim(one, still, every)[1][0]
+            u = np.asarray(trim(one, still, every)[1][0])
             if (np.abs(moved_at_start(task, u)) <= AT_REST_SHARE * away).all():
                 return u
     return None
