@@ -278,8 +278,7 @@ class Filtered:
 
     x: Array  # (T + 1, B, n) filtered
     x_prior: Array  # (T + 1, B, n) predicted
-    e: Array  # (T + 1, B, n) innovations, zero where not seen
-    eps: Array  # (T + 1, B, n) the same whitened
+    eps: Array  # (T + 1, B, n) innovations whitened, zero where not seen
     gains: Gains  # of T + 1 steps, the first an identity step; with covariances
     loglik: float
     status: str = "filtered"
@@ -289,7 +288,7 @@ def filtered(model: Model, batch: RecordBatch, noise: NoiseStd) -> Filtered:
     """Filter a batch. Divergence does not raise an exception: see `Filtered.status`."""
     (T, B), n = batch.valid.shape, model.n
     A, k, P = (np.zeros((T + 1, B, n, n)) for _ in range(3))
-    weight, e, eps, x, x_prior = (np.zeros((T + 1, B, n)) for _ in range(5))
+    weight, eps, x, x_prior = (np.zeros((T + 1, B, n)) for _ in range(4))
     A[0] = np.eye(n)
     system = _system(batch, noise, A)
     x_prior[0], P[0], status, t = batch.start, system.start[..., None] * np.eye(n), "filtered", 0
@@ -297,12 +296,12 @@ def filtered(model: Model, batch: RecordBatch, noise: NoiseStd) -> Filtered:
     with np.errstate(all="ignore"):
         try:
             for t in range(T + 1):
-                e[t] = np.where(batch.seen[t], model.difference(batch.y[t], x_prior[t]), 0.0)
+                e = np.where(batch.seen[t], model.difference(batch.y[t], x_prior[t]), 0.0)
                 seen = system.seen[t + 1]
                 H = seen[..., None] * np.eye(n)
                 k[t], W, after = updated(P[t], H, system.R[t + 1], seen)
                 weight[t] = np.einsum("bii->bi", W) * seen
-                eps[t] = (W @ e[t][..., None])[..., 0]
+                eps[t] = (W @ e[..., None])[..., 0]
                 x[t] = x_prior[t] + (k[t].swapaxes(1, 2) @ eps[t][..., None])[..., 0]
                 if t == T:
                     break
@@ -317,7 +316,7 @@ def filtered(model: Model, batch: RecordBatch, noise: NoiseStd) -> Filtered:
         except np.linalg.LinAlgError:
             status = f"the filter diverged to non-finite numbers at step {t + 1}"
     loglik = _likelihood(g, eps, batch) if status == "filtered" else -np.inf
-    return Filtered(x, x_prior, e, eps, g, loglik, status)
+    return Filtered(x, x_prior, eps, g, loglik, status)
 
 
 def smooth(one: Filtered) -> Array:

@@ -326,7 +326,10 @@ class Model:
         kind: Kind = "derivative" if self.derivative else "step"
         names = (self.state_names, self.input_names, self.param_names)
         signature = Signature(function, kind, *names).whole(self.integrator, self.substeps)
-        return signature.steps(x, u, self.values, dt)
+        try:
+            return signature.steps(x, u, self.values, dt)
+        except Exception:  # the compiler says what is wrong with the function
+            return self.system.step(x, u, self.values, dt)
 
     def difference(self, a: Array, b: Array) -> Array:
         """Return the difference a - b of states (..., n), with angles wrapped to [-pi, pi]."""

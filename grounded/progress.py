@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import signal
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -23,32 +21,6 @@ def interruptible(so_far: Callable[[], str]) -> Iterator[None]:
         raise
     except KeyboardInterrupt:
         raise Interrupted(so_far()) from None
-
-
-@contextmanager
-def within(seconds: float) -> Iterator[None]:
-    """Raise KeyboardInterrupt in the block once it takes this long [s].
-
-    In the main thread, where the system has timers; elsewhere the block has all the time it takes.
-    """
-    here = threading.current_thread() is threading.main_thread()
-    if not (here and hasattr(signal, "setitimer")):
-        yield
-        return
-
-    def over(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    before, began = signal.signal(signal.SIGALRM, over), time.monotonic()
-    left, again = signal.setitimer(signal.ITIMER_REAL, seconds)
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-        signal.signal(signal.SIGALRM, before)
-        if left:  # somebody else's timer goes on
-            rest = max(left - (time.monotonic() - began), 1e-3)
-            signal.setitimer(signal.ITIMER_REAL, rest, again)
 
 
 @dataclass

@@ -191,13 +191,9 @@ class Search:
         if not isinstance(given, Trial):
             do = "read" if isinstance(given, str | Path) else None
             raise wrong("the trial", got=f"a {type(given).__name__}", must="trial", do=do)
-        model, task_dt = self.task.model, self.task.dt
-        for kind, has, expected in (
-            ("states", trial.state_names, model.state_names),
-            ("inputs", trial.input_names, model.input_names),
-        ):
-            same_names("the trial", kind, has, expected)
-        same_dt("the trial", trial.dt, task_dt)
+        same_names("the trial", "states", trial.state_names, self.task.model.state_names)
+        same_names("the trial", "inputs", trial.input_names, self.task.model.input_names)
+        same_dt("the trial", trial.dt, self.task.dt)
 
     def tell(self, trial: Trial) -> None:
         """Add a trial of the real system; warn if it is evidently not its candidate's run.
@@ -279,21 +275,13 @@ def learn(
             return search
         candidate = search.ask()
         assert candidate is not None
-        search._add(replace(_run(run, candidate), candidate=candidate.id))
+        trial: Any = run(candidate)
+        if not isinstance(trial, Trial):
+            got = f"a {type(trial).__name__}"
+            raise wrong("what run(candidate) returns", got=got, must="trial")
+        search._add(replace(trial, candidate=candidate.id))
         if check:
             search._check_last(refuse=True)
-
-
-def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
-    """Run a candidate and return the trial.
-
-    Raises:
-        GroundedError: if the function returns no trial.
-    """
-    trial = run(candidate)
-    if not isinstance(trial, Trial):
-        raise wrong("what run(candidate) returns", got=f"a {type(trial).__name__}", must="trial")
-    return trial
 
 
 # --- checks of a trial that was told: those of `grounded ingest`, worded for a program ------------
@@ -302,18 +290,17 @@ def _run(run: Callable[[Candidate], Trial], candidate: Candidate) -> Trial:
 def odd_trial(
     task: Task, candidates: Sequence[Candidate], trial: Trial, *, first: bool
 ) -> Finding | None:
-    """Return why a trial can't be a run of its candidate as it is, if it can't.
+    """Return why a trial, as it was told, can't be a run of its candidate, if it can't.
 
-    Args:
-        task: the task of the candidates.
-        candidates: those proposed so far, one of which the trial names.
-        trial: the trial as it was told.
-        first: whether its columns are also checked against each other and the model.
+    The columns of the first one are also checked against each other and the model.
     """
     whole, model = interpolate_gaps(trial).trial, task.model
     own = next(one for one in candidates if one.id == trial.candidate)
-    if whole.finite_steps < 1 and (unknown := _unknown(trial)):
-        return found("given.value", *unknown, must="finite")
+    first_row = np.concatenate([trial.states[0], *trial.inputs[:1]])
+    signals = (*trial.state_names, *trial.input_names)
+    each = zip(signals, np.isfinite(first_row), strict=False)
+    if whole.finite_steps < 1 and (lacks := [name for name, finite in each if not finite]):
+        return found("given.value", *lacks, must="finite")
     seen = suspicion(task, whole, own, candidates)
     units = [(one.names, one.by) for one in seen.stories if one.kind is Kind.UNIT]
     names, by = units[0] if units else ((), 1.0)
@@ -332,14 +319,6 @@ def crashed(task: Task, trial: Trial) -> Finding | None:
     until, large = min(whole.finite_steps, whole.steps), whole.finite_steps >= task.horizon
     facts: dict[str, Any] = {"steps": max(until, 0), "horizon": task.horizon, "large": large}
     return found("run.failed", trial.candidate, **facts)
-
-
-def _unknown(trial: Trial) -> list[str]:
-    """Return the signals without a value at the start."""
-    known = [*np.isfinite(trial.states[0])]
-    known += [*np.isfinite(trial.inputs[0])] if trial.steps else []
-    names = (*trial.state_names, *trial.input_names)
-    return [name for name, is_known in zip(names, known, strict=False) if not is_known]
 
 
 def _odd_columns(model: Model, trial: Trial) -> Finding | None:

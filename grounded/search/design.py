@@ -80,8 +80,9 @@ class KnownNoise:
     hidden: tuple[str, ...]
 
     @classmethod
-    def of(cls, log_q: Array, log_r: Array, hidden: tuple[str, ...]) -> KnownNoise:
-        """Return white noise of these log variances of process and measurement, (n,) each."""
+    def of(cls, sizes: Array, hidden: tuple[str, ...]) -> KnownNoise:
+        """Return white noise of these standard deviations of process and measurement, (2, n)."""
+        log_q, log_r = 2 * np.log(sizes)
         still = np.full(len(log_q), -60.0)
         return cls(NoiseModel(Structure(), log_q, log_r, log_q.copy(), still), hidden)
 
@@ -116,13 +117,6 @@ def patterns(H: int, m: int) -> Iterator[tuple[str, tuple[float, float], Array]]
                 shape[:, j] = wave / np.abs(wave).max()
             yield "multisine", (low, high), shape
             yield "staircase", (low, high), np.round(2 * shape) / 2
-
-
-def _inside(task: Task, states: Array) -> bool:
-    """Return whether states (T + 1, n) are finite and stay inside [safety]."""
-    low, high = task.safety_low, task.safety_high
-    assert low is not None and high is not None
-    return bool(np.isfinite(states).all() and ((states >= low) & (states <= high)).all())
 
 
 # -- the drive --------------------------------------------------------------------------------
@@ -175,10 +169,12 @@ def design(task: Task, steps: int, noise: Array, hidden: tuple[str, ...] = ()) -
     if not drives:
         return None
 
-    # What is known of the sensors; then the drive that tells most.
+    # The noise as logged, else a share of what a state moves; then the drive that tells most.
     moved = np.median([np.ptp(run.states, axis=0) for *_, run in drives], axis=0)
-    unseen = [task.model.state_names.index(name) for name in hidden]
-    known = _expected_noise(noise, moved, unseen, hidden)
+    sensor = np.where(noise > 0, noise, NOISE * np.where(moved > 0, moved, 1.0))
+    sizes = np.array([UNMODELLED * sensor, sensor])
+    sizes[:, [task.model.state_names.index(name) for name in hidden]] = SILENT
+    known = KnownNoise.of(sizes, hidden)
     h, best = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0), None
     for pattern, cycles, size, policy, run in drives:
         F = information(task, run, h, known)
@@ -204,18 +200,6 @@ def _of_length(task: Task, steps: int) -> Task:
     )
 
 
-def _expected_noise(
-    noise: Array, moved: Array, unseen: Sequence[int], hidden: tuple[str, ...]
-) -> KnownNoise:
-    """Return the noise that drives are judged by: as logged, else a share of what a state moves."""
-    size = np.where(moved > 0, moved, 1.0)
-    sensor = np.where(noise > 0, noise, NOISE * size)
-    log_r, log_q = 2 * np.log(sensor), 2 * np.log(UNMODELLED * sensor)
-    for logs in (log_r, log_q):
-        logs[list(unseen)] = 2 * np.log(SILENT)
-    return KnownNoise.of(log_q, log_r, hidden)
-
-
 def _drives(
     task: Task, gain: Array | None
 ) -> list[tuple[str, tuple[float, float], float, Policy, Trial]]:
@@ -232,23 +216,17 @@ def _drives(
     others = [one for one in others if held is not None and _safe(task, one, held) is not None]
 
     # The largest size of each.
-    up, down = task.high - task.past, task.past - task.low
-
-    def largest(shape: Array) -> tuple[float, Policy, Trial] | None:
+    up, down, found = task.high - task.past, task.past - task.low, []
+    for pattern, cycles, shape in patterns(task.horizon, task.model.m):
         for size in SIZES:
             sent = task.past + size * np.where(shape > 0, shape * up, shape * down)
             policy = _about_its_run(task, sent, gain)
             if policy is None or (run := _safe(task, problem, policy)) is None:
                 continue
             if all(_safe(task, one, policy) is not None for one in others):
-                return size, policy, run
-        return None
-
-    each = (
-        (pattern, cycles, largest(shape))
-        for pattern, cycles, shape in patterns(task.horizon, task.model.m)
-    )
-    return [(pattern, cycles, *made) for pattern, cycles, made in each if made is not None]
+                found.append((pattern, cycles, size, policy, run))
+                break
+    return found
 
 
 def _about_its_run(task: Task, sent: Array, gain: Array | None) -> Policy | None:
@@ -268,7 +246,8 @@ def _about_its_run(task: Task, sent: Array, gain: Array | None) -> Policy | None
 def _safe(task: Task, problem: Problem, policy: Policy) -> Trial | None:
     """Return the run of a policy in a model; None if it leaves [safety] or diverges."""
     run = _run(task, problem, policy)
-    return run if run is not None and _inside(task, run.states) else None
+    inside = run is not None and (run.states == task.inside_safety(run.states)).all()
+    return run if inside else None
 
 
 def _regulator(task: Task) -> Array:
@@ -313,14 +292,9 @@ def probe(
     trials: Sequence[Trial],
     library: Library | None = None,
 ) -> Probe | None:
-    """Find the best probe for the first indistinguishable group.
+    """Find the best probe for the first indistinguishable group of a diagnosis of trials.
 
-    Args:
-        task: limits, start, safety, latency.
-        policy: the policy that the probe is added to, usually the best so far.
-        diagnosis: names the group and the values of the hypotheses.
-        trials: the trials it was made from.
-        library: source of the effects.
+    It is added to a policy, usually the best so far.
 
     Returns:
         The probe; None if nothing ties that a trial could separate, or no probe is safe.
@@ -331,7 +305,12 @@ def probe(
         return None
     names, library, latest = ties[0], library or Library(), trials[-REPLAYED:]
     task, first, rival = _tied(task, diagnosis, trials, library, names)
-    noise = _found_noise(task.model, diagnosis)
+    states, known = task.model.state_names, diagnosis.noise
+    levels = (
+        [of.get(n, 0.0) + SILENT for n in states] for of in (known.process, known.measurement)
+    )
+    hidden = tuple(n for n in states if n not in known.process)
+    noise = KnownNoise.of(np.array([*levels]), hidden)
     fit = noise.fitted(task, latest, in_place(first, {names[0]: (rival,)}), ADAPTED)
     if fit is None:
         return None
@@ -341,8 +320,8 @@ def probe(
     ways = []
     for both in ((first, second), (second, first)):
         again = (_replayed(task, both[0], trial, library) for trial in latest)
-        known = [run for run in again if run is not None]
-        ways.append((both, known, _apart(task, noise, both, known)))
+        made = [run for run in again if run is not None]
+        ways.append((both, made, _apart(task, noise, both, made)))
     told = ways[0][2] * len(trials) / max(len(ways[0][1]), 1)
     rows = [diagnosis.ranked(name) for name in names]
     nats = [row.evidence for row in rows if row is not None and np.isfinite(row.evidence)] or [0.0]
@@ -352,13 +331,13 @@ def probe(
     best: tuple[float, Policy, str] | None = None
     models = [_model(task, h, library) for h in (first, second)]
     for words, candidate in _added(policy, task.model, names):
-        runs = [_run(task, model, candidate) for model in models]
-        kept = [run for run in runs if run is not None and _inside(task, run.states)]
+        runs = [_safe(task, model, candidate) for model in models]
+        kept = [run for run in runs if run is not None]
         if len(kept) < len(runs):
             continue
         expected = min(
-            max(_apart(task, noise, both, [*known, run]) - so_far, 0.0)
-            for (both, known, so_far), run in zip(ways, kept, strict=True)
+            max(_apart(task, noise, both, [*made, run]) - so_far, 0.0)
+            for (both, made, so_far), run in zip(ways, kept, strict=True)
         )
         if best is None or expected > best[0]:
             best = (expected, candidate, words)
@@ -374,17 +353,6 @@ def probe(
     claimed = claimed if most < SEPARABLE_NATS and not diagnosis.doubt else None
     step = found("gap.next.no_probe", *names, claimed=claimed, **pair)
     return Probe(chosen, expected, step, little=True)
-
-
-def _found_noise(model: Model, diagnosis: Diagnosis) -> KnownNoise:
-    """Return the noise that a diagnosis found."""
-
-    def logs(levels: Mapping[str, float]) -> Array:
-        return np.array([2 * np.log(levels.get(n, 0.0) + SILENT) for n in model.state_names])
-
-    known = diagnosis.noise
-    hidden = tuple(n for n in model.state_names if n not in known.process)
-    return KnownNoise.of(logs(known.process), logs(known.measurement), hidden)
 
 
 def _tied(

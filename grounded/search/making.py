@@ -293,7 +293,7 @@ class Maker:
             return Proposal(self.now, made, is_new=True)
         ending = Ending.GAINS if against[0].code == "plan.gain" else Ending.NOT_ALLOWED
         stopped = ended(self.now, ending, against[0])
-        return Proposal(stopped, None, is_new=False, findings=against, refused=made)
+        return Proposal(stopped, None, is_new=False, findings=against)
 
 
 # --- the direction of a step (step 5) ---

@@ -225,7 +225,6 @@ class Proposal(Result):
     candidate: Candidate | None
     is_new: bool  # whether the candidate was made by this call
     findings: tuple[Finding, ...] = ()  # on the candidate, or why it was refused
-    refused: Candidate | None = None
 
     def summary(self) -> str:
         """Return the summary of the candidate, or of the standing if there is none."""
@@ -373,37 +372,28 @@ def let_down(now: Standing, model: str) -> Standing:
     best = now.incumbent
     if best is None:
         return now
-    lost, missed = losers_of(now.history, best.candidate.id, model), list[tuple[float, Tried]]()
+    lost, most, gain = losers_of(now.history, best.candidate.id, model), None, 0.0
     for tried in now.history:
-        made = tried.candidate
-        between = Difference(best, tried, now.history)
-        # a plan may replay a log's noise
-        noise = max(LUCK * between.error if between.known else 0.0, tried.noise_cost)
+        made, between = tried.candidate, Difference(best, tried, now.history)
         if made.of_model_alone and made.model == model:
-            short = gain = tried.promised - best.utility
+            short = promised = tried.promised - best.utility
         elif made in lost and not made.doubtful:
-            loss, gain = -tried.gain_over(best), made.predicted_gain
-            short = min(loss + gain, max(loss, gain))
+            loss, promised = -tried.gain_over(best), made.predicted_gain
+            short = min(loss + promised, max(loss, promised))
         else:
             continue
-        if short > noise:
-            missed.append((gain, tried))
-    gain, most = max(missed, key=lambda one: one[0], default=(0.0, None))
+        # a plan may replay a log's noise
+        if promised > gain and short > max(
+            LUCK * between.error if between.known else 0.0, tried.noise_cost
+        ):
+            most, gain = tried, promised
     if most is None or not gain > DOUBTFUL_GAIN * -best.utility:
         return now
-    if most.candidate.of_model_alone:
-        own = best.candidate.id
-        reached = found(
-            "search.within_model",
-            own,
-            then=DIAGNOSE,
-            best=own,
-            real=best.utility,
-            promised=best.utility + gain,
-            by=gain,
-        )
-        return now.with_finding(reached)
-    return now.with_finding(_far_off(most, most.promised))
+    if not most.candidate.of_model_alone:
+        return now.with_finding(_far_off(most, most.promised))
+    own, reached = best.candidate.id, best.utility + gain
+    facts: dict[str, Any] = {"best": own, "real": best.utility, "promised": reached, "by": gain}
+    return now.with_finding(found("search.within_model", own, then=DIAGNOSE, **facts))
 
 
 def _far_off(tried: Tried, promised: float) -> Finding:
@@ -416,18 +406,15 @@ def _far_off(tried: Tried, promised: float) -> Finding:
 
 def _suspicion(history: tuple[Tried, ...], incumbent: Tried, model: str) -> Finding | None:
     """Return why a diagnosis would help more than the next trial; None if there is no reason."""
-    if history[-1].candidate.model != model:
+    last, lost = history[-1], 0
+    if last.candidate.model != model:
         return None  # the model has changed since: the next trial shows the effect
-    lost = 0
     for tried in history:
-        if tried is incumbent or tried.accepted is not False:
-            lost = 0
-        lost += tried.lost
+        lost = tried.lost + (lost if tried is not incumbent and tried.accepted is False else 0)
     if lost >= LOST:
         return found("search.lost_in_row", then=DIAGNOSE, lost=lost)
     if wild(incumbent):
         return _far_off(incumbent, incumbent.candidate.predicted_utility)
-    last = history[-1]
     if last.lost and _far_below(last, min(last.promised, incumbent.utility)):
         return _far_off(last, last.promised)
     return None

@@ -139,7 +139,7 @@ def usual(task):
 
 def left_by(task, run, noise):
     """What a run leaves of each uncertain parameter's standard deviation, as a share of it."""
-    known = KnownNoise.of(2 * np.log(0.1 * noise), 2 * np.log(noise), ())
+    known = KnownNoise.of(np.array([0.1 * noise, noise]), ())
     h = Hypothesis(shift=np.zeros(task.model.system.k), spread=1.0)
     F = information(task, run, h, known)
     shares = np.sqrt(np.diag(np.linalg.inv(F + np.eye(len(F)))))
