@@ -61,12 +61,7 @@ class Found:
 
 
 def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
-    """Evaluate a path on messages.
-
-    Args:
-        part: the messages.
-        path: the path.
-        stamps: whether to read the time stamps too; only numbers with one are then returned.
+    """Evaluate a path on messages; with `stamps`, only numbers with one are returned.
 
     Raises:
         BadMessage: for a stamp outside the calendar.
@@ -85,7 +80,7 @@ def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
     found, messages = np.array(at, dtype=np.int64), np.array(rows, dtype=np.int64)
     if not names:
         return Found(messages[found], values, None)
-    stamped, of = _walk([*range(len(holders))], holders, [Field(name) for name in names])
+    stamped, of = _fields([*range(len(holders))], holders, names)
     known, times = np.zeros(len(holders), np.bool_), np.zeros(len(holders), np.int64)
     known[stamped], times[stamped] = True, _times(of, messages[stamped])
     good = known[found]
@@ -93,11 +88,7 @@ def evaluate(part: Decoded, path: MessagePath, *, stamps: bool) -> Found:
 
 
 def _in_columns(part: Decoded, path: MessagePath, stamps: bool) -> Found:
-    """Evaluate a path on one object whose numbers are columns.
-
-    Raises:
-        BadPath: if it does not lead to one column.
-    """
+    """Evaluate a path on one object whose numbers are columns; refuse one to several."""
     whole, table = [part.columns], part.decode is None
     split, names = _stamped(whole, path.steps) if stamps and not table else (0, ())
     _, holders = _walk([0], whole, path.steps[:split])
@@ -106,7 +97,7 @@ def _in_columns(part: Decoded, path: MessagePath, stamps: bool) -> Found:
         raise BadPath("path", expected="one value", found=str(len(ends) or "nothing"))
     values, rows = _apply(ends, path.function, columns=True), np.arange(len(part.log_times))
     if not table:
-        _, of = _walk([0] * len(holders), holders, [Field(name) for name in names])
+        _, of = _fields([0] * len(holders), holders, names)
         return Found(rows, values, _times(of, rows) if names else None)
     # A table of a run may end with a state after its last command.
     count = len(values) - bool(len(values) > 1 and not np.isfinite(values[-1]))
@@ -116,33 +107,37 @@ def _in_columns(part: Decoded, path: MessagePath, stamps: bool) -> Found:
 def _walk(rows: list[int], values: Values, steps: Sequence[Step]) -> tuple[list[int], Values]:
     """Follow steps from the values of some rows: a row may then have several values, or none."""
     for step in steps:
-        if isinstance(step, Field):
-            _check_field(values, step.name)
-            inner = fields_of(values, step.name)
-        elif isinstance(step, Filter):
-            inner = [
-                v if ok else ABSENT for v, ok in zip(values, _passes(values, step), strict=True)
-            ]
-        else:
+        if isinstance(step, Slice):
             chosen = [_items(value, step) for value in values]
             rows = [row for row, some in zip(rows, chosen, strict=True) for _ in some]
             values = [item for some in chosen for item in some]
             continue
-        if any(one is ABSENT for one in inner):
-            rows = [row for row, one in zip(rows, inner, strict=True) if one is not ABSENT]
+        if isinstance(step, Field):
+            _check_field(values, step.name)
+            inner = fields_of(values, step.name)
+        else:
+            held = zip(values, _passes(values, step), strict=True)
+            inner = [value if passed else ABSENT for value, passed in held]
+        rows = [row for row, one in zip(rows, inner, strict=True) if one is not ABSENT]
         values = [one for one in inner if one is not ABSENT]
     return rows, values
+
+
+def _fields(rows: list[int], values: Values, names: Sequence[str]) -> tuple[list[int], Values]:
+    """Follow names of fields, as `_walk` does."""
+    return _walk(rows, values, [Field(name) for name in names])
 
 
 def _check_field(values: Values, name: str) -> None:
     """Check that values may have a field: a JSON object may have any."""
     first: Any = next((one for one in values if one is not None), {})
-    there = [one for one in names_in(first) if one != "header"]
-    if isinstance(first, dict) or name in names_in(first):
+    names = names_in(first)
+    if isinstance(first, dict) or name in names:
         return
-    if not names_in(first):
+    if not names:
         expected = "[0] or [:]" if is_list(first) else "message"
         raise BadPath("path", at=name, expected=expected, found=_kind(first))
+    there = [one for one in names if one != "header"]
     alike = in_another_unit(name, there)
     others: dict[str, Any] = {"near": alike[0]} if alike else near(name, there)
     raise BadPath("given.name", name, kind="field", of=_kind(first), **others)
@@ -172,19 +167,15 @@ def _items(value: Any, step: Slice) -> Values:
 
 
 _COMPARE: dict[str, Callable[[Any, Any], bool]] = {
-    "==": operator.eq,
-    "!=": operator.ne,
-    "<": operator.lt,
-    "<=": operator.le,
-    ">": operator.gt,
-    ">=": operator.ge,
+    **{"==": operator.eq, "!=": operator.ne},
+    **{"<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge},
 }
 
 
 def _passes(values: Values, step: Filter) -> list[bool]:
     """Return where a filter holds; it does not without its field."""
     passes = [False] * len(values)
-    rows, inner = _walk([*range(len(values))], values, [Field(name) for name in step.path])
+    rows, inner = _fields([*range(len(values))], values, step.path)
     for row, value in zip(rows, inner, strict=True):
         value = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
         known = value is None or isinstance(value, str) or _is_number(value)
@@ -204,15 +195,12 @@ def _stamped(objects: Sequence[Any], steps: Sequence[Step]) -> tuple[int, tuple[
     The first message decides that the path goes through.
     """
     found = 0, _stamp_in(next(iter(objects), None))
-    ways = [Slice(0, -1) if isinstance(step, Slice) else step for step in steps]
     for one in objects:
         values: Values = [one]
-        for i, step in enumerate(ways, start=1):
-            values = (
-                values
-                if isinstance(step, Filter)
-                else _walk([0] * len(values), values, [step])[1][:1]
-            )
+        for i, step in enumerate(steps, start=1):
+            if not isinstance(step, Filter):
+                way = Slice(0, -1) if isinstance(step, Slice) else step
+                values = _walk([0] * len(values), values, [way])[1][:1]
             if values and (names := _stamp_in(values[0])):
                 found = i, names
         if values:
@@ -239,11 +227,7 @@ def is_time(value: Any) -> bool:
 
 
 def _times(stamps: Values, messages: Ints) -> Ints:
-    """Return stamps [ns], of some messages.
-
-    Raises:
-        BadMessage: for one outside the calendar.
-    """
+    """Return stamps [ns], of some messages, within the calendar."""
     if not stamps:
         return np.zeros(0, np.int64)
     whole, rest = (_part(stamps, part).ravel() for part in names_in(stamps[0]))
@@ -292,10 +276,9 @@ def _is_number(value: Any) -> bool:
 
 
 def _part(values: Values, *names: str) -> Floats:
-    """Return a number of each object; NaN where it is absent. Of a table (1, N)."""
+    """Return a number of each object, NaN where it is absent; of a table (1, N)."""
     found: Values = [np.nan] * len(values)
-    rows, inner = _walk([*range(len(values))], values, [Field(name) for name in names])
-    for row, value in zip(rows, inner, strict=True):
+    for row, value in zip(*_fields([*range(len(values))], values, names), strict=True):
         found[row] = value
     return _column(found)
 
@@ -306,32 +289,38 @@ def _column(values: Values) -> Floats:
     return np.array(values, dtype=np.float64) if of_table else _numbers(values)
 
 
-def _turn(values: Values, *names: str) -> list[Floats]:
-    """Return the quaternion (x, y, z, w) that names lead to, of length 1; NaN for zero."""
-    turns = _walk([0] * len(values), values, [Field(name) for name in names])[1]
+def _turn(values: Values, *names: str) -> Floats:
+    """Return the quaternions (4, N), x y z w, that names lead to, of length 1; NaN for zero."""
+    turns = _fields([0] * len(values), values, names)[1]
     known = [one for one in turns if one is not None]
     if all(is_list(one) and len(one) == 4 for one in known):
-        quaternion = [
-            _column([None if one is None else one[i] for one in turns]).ravel()
-            for i in (1, 2, 3, 0)
-        ]
+        some = [[None if one is None else one[i] for one in turns] for i in (1, 2, 3, 0)]
+        quaternion = np.array([_column(parts).ravel() for parts in some])
     elif all({*QUATERNION} <= {*names_in(one)} for one in known):
-        quaternion = [_part(turns, name).ravel() for name in QUATERNION]
+        quaternion = np.array([_part(turns, name).ravel() for name in QUATERNION])
     else:
         raise BadPath("path", at="@rpy", expected="x, y, z, w", found=_kind(known[0]))
     with np.errstate(invalid="ignore", divide="ignore"):
-        norm = np.sqrt(sum(q**2 for q in quaternion))
-        return [q / norm for q in quaternion]
+        unit: Floats = quaternion / np.sqrt((quaternion**2).sum(axis=0))
+    return unit
 
 
-def _angle(name: str, turn: Sequence[Floats]) -> Floats:
-    """Return roll, pitch or yaw [rad] for R = Rz(yaw) Ry(pitch) Rx(roll); NaN for zero."""
+def _matrix(turn: Floats) -> Sequence[Sequence[Floats]]:
+    """Return R = Rz(yaw) Ry(pitch) Rx(roll) of quaternions (4, N), row by row."""
     x, y, z, w = turn
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+    )
+
+
+def _angle(name: str, turn: Floats) -> Floats:
+    """Return roll, pitch or yaw [rad] of quaternions; NaN for zero."""
+    R = _matrix(turn)
     if name == "pitch":
-        return np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
-    if name == "roll":
-        return np.arctan2(2 * (w * x + y * z), 1 - 2 * (x**2 + y**2))
-    return np.arctan2(2 * (w * z + x * y), 1 - 2 * (y**2 + z**2))
+        return np.arcsin(np.clip(0.0 - R[2][0], -1, 1))
+    return np.arctan2(R[2][1], R[2][2]) if name == "roll" else np.arctan2(R[1][0], R[0][0])
 
 
 def _in_world(values: Values, axis: int) -> Floats:
@@ -339,13 +328,8 @@ def _in_world(values: Values, axis: int) -> Floats:
     if not all(map(_is_odometry, values)):
         both = f"{'.'.join(TURNED)} and {'.'.join(MOVING)}"
         raise BadPath("path", at=f"@{WORLD}", expected=both, found=_kind(values[0]))
-    x, y, z, w = _turn(values, *TURNED)
+    row = _matrix(_turn(values, *TURNED))[axis]
     v = [_part(values, *MOVING, name).ravel() for name in AXES]
-    row = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-    )[axis]
     return row[0] * v[0] + row[1] * v[1] + row[2] * v[2]
 
 

@@ -187,7 +187,7 @@ def begin(
         columns, sent, odd_run = _recorded(logs, tomllib.loads(table), made, states, step)
         horizon, name = len(next(iter(columns.values()))) - 1, Path(log).name
         stood = held_first(made, columns, sent, step)
-        write_first(folder, made, step, columns, horizon, ranges, table, why, name, stood)
+        write_first(folder, made, step, columns, ranges, table, why, name, stood)
         more = [*_on_own(report, (*states, *commands), made)] if own else []
         return Begun(
             workspace=str(folder),

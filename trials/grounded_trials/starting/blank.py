@@ -22,6 +22,7 @@ from grounded.frozen import Array
 from grounded.model import Model
 from grounded.task import Task
 from grounded.utility import Reward
+from grounded_trials.starting import template
 from grounded_trials.starting.examples import fresh_folder, toml_of
 from grounded_trials.starting.own_model import own_model
 from grounded_trials.store.store import write_atomically
@@ -32,54 +33,6 @@ from grounded_trials.workspace.user_files.task_file import change_weight, write_
 DT, HORIZON = 0.05, 100  # [s], steps
 COMMAND = 'command = "python drive.py {candidate} {trial}"   # or by hand: propose, drive, ingest'
 CHANGES = "# for inputs from -1 to 1: `target` updates it from the limits until you change it"
-RUNS = '''"""The robot's program: runs a candidate and writes its trial. `grounded run` calls it as
-
-    python drive.py candidates/c0001.mcap runs/c0001-1.mcap
-"""
-
-import sys
-import time
-from contextlib import suppress
-from dataclasses import replace
-from pathlib import Path
-
-import numpy as np
-
-from grounded.policy import load
-from grounded_trials.store.trial_file import TrialWriter
-
-STATES = {states}
-INPUTS = {inputs}
-
-
-def measure():
-    """Return the robot's current states in the order of STATES, one number each."""
-    raise SystemExit("{left}")
-
-
-def send(u):
-    """Send the inputs u, in the order of INPUTS; they are within [limits]."""
-    raise SystemExit("{left}")
-
-
-def main(candidate, trial):
-    runner = load(candidate, states=tuple(STATES), inputs=tuple(INPUTS))
-    dt, steps = runner.policy.dt, len(runner.policy.feedforward)
-    ran = dict(candidate=Path(candidate).stem, policy=Path(candidate).read_bytes())
-    about = dict(dt=dt, states=STATES, inputs=INPUTS, meta={{"kind": "trial"}})
-    with TrialWriter(trial, **about, **ran) as log:
-        start = time.monotonic()
-        for step in range(steps + 1):
-            time.sleep(max(0.0, start + step * dt - time.monotonic()))
-            state = np.asarray(measure(), dtype=float)
-            u = runner.action(step * dt, state)  # after the last step: the input before the start
-            send(u)
-            log.append(step * dt, state, u if step < steps else None)
-
-
-if __name__ == "__main__":
-    main(*sys.argv[1:])
-'''
 
 
 def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None:
@@ -100,8 +53,8 @@ def write_blank(folder: Path, file: str | Path, dt: float | None = None) -> None
         task = _task(model, dt or DT)
         columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
         write_target(folder / "target.csv", task.dt, columns)
-        drive = RUNS.format(states=dict(model.states), inputs=dict(model.inputs), left=UNWRITTEN)
-        write_atomically(folder / DRIVE, drive.encode())
+        told = {"states": dict(model.states), "inputs": dict(model.inputs), "left": UNWRITTEN}
+        write_atomically(folder / DRIVE, template(DRIVE).format(**told).encode())
         name = f"{model.name or own.file.stem}: set your own target, weights and limits"
         text = toml_of(task, name, COMMAND, explicit=True)
         text = text.replace("\ninput_change", f"\n{CHANGES}\ninput_change")

@@ -15,7 +15,8 @@ import numpy as np
 
 from grounded.checks import known, refused
 from grounded.task import Task
-from grounded_trials.starting.first_toml import TASK, inline, number
+from grounded_trials.starting import template
+from grounded_trials.starting.first_toml import inline, number
 from grounded_trials.store.store import made_folder, sweep, write_atomically
 from grounded_trials.toml_table import key
 from grounded_trials.workspace.user_files.config import FILE
@@ -28,7 +29,7 @@ class Example:
 
     text: str
     model: str  # module of the crude model, copied to model.py
-    real: str  # contents of real.py
+    real: str  # template of real.py
     tasks: str  # module and function (..., model) of its task
     arguments: tuple[str, ...] = ()
 
@@ -44,54 +45,23 @@ class Example:
         return import_module(self.model)
 
 
-_REAL_CAR = '''"""The simulated REAL car, in place of your robot. The search never reads it."""
-
-from grounded.experiments.real_car import LATENCY, real_car
-
-model = real_car()
-latency = LATENCY  # [s]; the task assumes 0.1
-'''
-
-_REAL_AIRCRAFT = '''"""The simulated REAL aircraft: its parameters differ from the crude model's."""
-
-import numpy as np
-
-from grounded.experiments.figure8 import perturbed
-from grounded.models import aircraft
-
-model = perturbed(aircraft.model, np.random.default_rng(4))
-substeps = 1
-'''
-
-_REAL_PENDULUM = '''"""The simulated REAL pendulum: heavier, with dry friction in its bearing."""
-
-from grounded.experiments.pendulum import model
-'''
-
-
-_CAR = "grounded.models.car", _REAL_CAR, "grounded.experiments.car_tasks.car_task"
+_CAR = "grounded.models.car", "real_car.py", "grounded.experiments.car_tasks.car_task"
 EXAMPLES: Mapping[str, Example] = {
-    "car-turn": Example(
-        "RC car, open loop: a quarter turn from standstill", *_CAR, arguments=("turn",)
-    ),
-    "car-circle": Example(
-        "RC car, closed loop: 1.4 m/s on a 1 m circle", *_CAR, arguments=("circle",)
-    ),
+    "car-turn": Example("RC car, open loop: a quarter turn from standstill", *_CAR, ("turn",)),
+    "car-circle": Example("RC car, closed loop: 1.4 m/s on a 1 m circle", *_CAR, ("circle",)),
     "car-figure8": Example(
-        "RC car, closed loop: a figure-8, 1.4 m/s straights, 1.0 m/s turns",
-        *_CAR,
-        arguments=("figure8",),
+        "RC car, closed loop: a figure-8, 1.4 m/s straights, 1.0 m/s turns", *_CAR, ("figure8",)
     ),
     "flight-figure8": Example(
         "fixed-wing aircraft, 60 s: a figure-8 at fixed altitude",
         "grounded.models.aircraft",
-        _REAL_AIRCRAFT,
+        "real_aircraft.py",
         "grounded.experiments.figure8.flight_task",
     ),
     "pendulum": Example(
         "pendulum: swing up to standing, the smallest example",
         "grounded.models.pendulum",
-        _REAL_PENDULUM,
+        "real_pendulum.py",
         "grounded.experiments.pendulum.pendulum_task",
     ),
 }
@@ -121,7 +91,7 @@ def write_example(folder: Path, name: str) -> None:
         if np.isfinite(task.target[:, i]).all()
     }
     files = {"target.csv": target_text(task.dt, columns), "model.py": _source(chosen.module)}
-    files |= {"real.py": chosen.real, FILE: toml_of(task, name)}
+    files |= {"real.py": template(chosen.real), FILE: toml_of(task, name)}
     with fresh_folder(folder, files):
         for file, text in files.items():
             write_atomically(folder / file, text.encode())
@@ -202,7 +172,7 @@ def toml_of(task: Task, name: str, system: str = SIMULATED, *, explicit: bool = 
         if np.isfinite(low) and np.isfinite(high)
     ]
     lines = (f"{k} = {inline({n: w for n, w in v.items() if w})}" for k, v in weights.items())
-    return TASK.format(
+    return template(FILE).format(
         title=f"{name}: {EXAMPLES[name].text}" if name in EXAMPLES else name,
         model=f"smoothing = {number(task.smoothing)}              # of np.where, abs ...\n",
         dt=number(task.dt),

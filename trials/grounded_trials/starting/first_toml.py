@@ -11,6 +11,7 @@ import numpy as np
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.trial import Trial
+from grounded_trials.starting import template
 from grounded_trials.starting.shapes import has_plane
 from grounded_trials.store.store import write_atomically
 from grounded_trials.toml_table import key
@@ -19,43 +20,6 @@ from grounded_trials.workspace.off_target import usual_weights
 from grounded_trials.workspace.user_files.config import FILE, OFFERED
 from grounded_trials.workspace.user_files.task_file import change_weight, write_target
 
-TASK = """# {title}
-
-[model]
-file = "model.py"             # the crude model
-{model}
-[task]
-dt = {dt}                     # [s] control interval
-horizon = {horizon}                 # steps
-target = "target.csv"         # `grounded target` draws another; no column: free
-start = {start}
-feedback = {feedback}               # false: open loop
-latency = {latency}  # [s] transport delay of inputs
-
-[reward]                      # quadratic weights; utility = -sum
-{weights}
-
-[limits]                      # hard limits of the real inputs
-{limits}
-
-[search]
-{search}max_trials = 40
-
-{rest}
-"""
-WEIGHTS = """# 1 / (range in the target, at least 0.1)^2; for coordinates of a position the smaller
-# range (at least a fifth of the larger), a tenth of it for a velocity beside its
-# position; a constant column uses the largest range of its unit, else 1. `target` updates
-# them until you change one
-state = {state}
-# terminal: weights of the last step only. If the run must END at rest on its target
-# (docking, parking) but overshoots, use 10 to 100 times `state`, also for the speeds
-# terminal = {terminal}
-# input_change: weights of (a_t - a_{{t-1}})^2; larger ones make inputs smoother. Until
-# you change them, `target` sets them to 0.04 / (range in [limits])^2. To know whether
-# you did, it compares them with the next line: leave that one as it is
-# input_change = {changes}
-input_change = {changes}"""
 SEEN = """# SEEN in the log, 0 included: enter those of your robot, then delete these two lines
 seen_in = {log}"""
 
@@ -76,7 +40,6 @@ def write_first(
     model: Model,
     dt: float,
     columns: Mapping[str, Array],
-    horizon: int,
     ranges: Mapping[str, tuple[float, float] | None],
     table: str,
     why: str,
@@ -90,7 +53,6 @@ def write_first(
         model: its crude model.
         dt: control interval [s].
         columns: columns of the target, by state.
-        horizon: number of steps.
         ranges: lowest and highest value of each signal in the log, in the model's unit.
         table: the [log] table, as text.
         why: why this kind of robot was chosen.
@@ -112,19 +74,17 @@ def write_first(
     if limits:
         limits.append(SEEN.format(log=json.dumps(log, ensure_ascii=False)))
     offered = {name: OFFERED * weight for name, weight in weights.items()}
-    state, terminal, change = (
-        inline({name: _rounded(value) for name, value in some.items()})
-        for some in (weights, offered, changes)
-    )
-    text = TASK.format(
+    state, terminal, change = map(_short, (weights, offered, changes))
+    weighed = template("weights.toml").rstrip()
+    text = template(FILE).format(
         title=f"made from a log by `grounded init --from` ({why})",
         model="",
         dt=number(dt),
-        horizon=horizon,
-        start=inline({name: _rounded(value) for name, value in held.items()}),
+        horizon=len(next(iter(columns.values()))) - 1,
+        start=_short(held),
         feedback="true",
-        latency=inline({name: _rounded(value) for name, value in late.items()}),
-        weights=WEIGHTS.format(state=state, terminal=terminal, changes=change),
+        latency=_short(late),
+        weights=weighed.format(state=state, terminal=terminal, changes=change),
         limits="\n".join(limits) or "# those of your robot",
         search="",
         rest=table.rstrip(),
@@ -157,5 +117,5 @@ def _span(ends: Sequence[float]) -> str:
     return f"[{', '.join(f'{end:.6g}' for end in ends)}]"
 
 
-def _rounded(value: float) -> float:
-    return float(f"{value:.6g}")
+def _short(values: Mapping[str, float]) -> str:
+    return inline({name: float(f"{value:.6g}") for name, value in values.items()})

@@ -71,8 +71,8 @@ def path_target(
         raise refused("start.sideways", model.name, speed=across, ahead=ahead)
     _check(drive)
     along, x, y, heading = _path(shape, drive)
-    curvature = np.abs(np.gradient(heading, along))
-    limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(curvature, 1e-9)))
+    curvature = np.gradient(heading, along)
+    limit = np.minimum(drive.speed, np.sqrt(drive.lateral / np.maximum(abs(curvature), 1e-9)))
     limit[-1] *= not drive.hold
     speed = _reachable(along, limit, drive.accel)
     _, far, pace = _driven(along, speed, drive.hold, dt)
@@ -80,13 +80,22 @@ def path_target(
         name: start.get(name, 0.0) + np.interp(far, along, way)
         for name, way in zip(position, (x, y), strict=False)
     }
-    bend = np.interp(far, along, np.gradient(heading, along))
-    turned = np.interp(far, along, heading)
+    bend, turned = (np.interp(far, along, course) for course in (curvature, heading))
     for role, values in {"heading": turned, "speed": pace, "heading_rate": bend * pace}.items():
         played = model.roles.get(role)
         if isinstance(played, str) and played in model.states:
             columns[played] = values
-    return columns | _kept(model, to, start, columns, bool(drive.hold))
+
+    # What keeps a value: as `to` says, and the height.
+    held = _placed(to, model, bool(drive.hold))
+    for name in held:
+        if name in columns:
+            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="path")
+    for height in position[2:]:
+        if height not in {**start, **to}:
+            raise wrong(f"--to {height}", must="given", like=f"--to {height}=1.5")
+        held.setdefault(height, start.get(height, 0.0))
+    return columns | {name: np.full(len(far), value) for name, value in held.items()}
 
 
 def _roles(model: Model) -> str:
@@ -117,33 +126,12 @@ def _driven(
     return t, along[i] + part * lasts[i] * (speed[i] + pace) / 2, pace
 
 
-def _kept(
-    model: Model,
-    to: Mapping[str, float],
-    start: Mapping[str, float],
-    drawn: Mapping[str, Array],
-    at_rest: bool,
-) -> dict[str, Array]:
-    """Return the columns of states that keep a value along a path."""
-    _check_states(to, model)
-    held = _placed(to, model, at_rest)
-    for name in held:
-        if name in drawn:
-            raise refused("start.follows_path", name, asked=f"{to[name]:g}", why="path")
-    for height in model.roles["position"][2:]:
-        if height not in {**start, **to}:
-            raise wrong(f"--to {height}", must="given", like=f"--to {height}=1.5")
-        held.setdefault(height, start.get(height, 0.0))
-    rows = len(next(iter(drawn.values())))
-    return {name: np.full(rows, value) for name, value in held.items()}
-
-
 def _placed(to: Mapping[str, float], model: Model, at_rest: bool) -> dict[str, float]:
     """Return what --to asks of states that are no velocities, which follow a line or path.
 
-    Raises:
-        GroundedError: for a velocity that it does not end with.
+    A velocity must end as the line or path does.
     """
+    _check_states(to, model)
     moving = [name for name in to if name in velocities_of(model)]
     for name in moving:
         if to[name] or not at_rest:
@@ -165,11 +153,7 @@ def _grid(seconds: float, dt: float) -> Array:
 
 
 def in_steps(seconds: float, dt: float, steps: float) -> int:
-    """Return a target's number of control steps as an integer.
-
-    Raises:
-        GroundedError: if there are fewer than FEWEST or more than MAX_HORIZON.
-    """
+    """Return a target's number of control steps as an integer; refuse too few or too many."""
     if FEWEST <= steps <= MAX_HORIZON:
         return int(steps)
     what = f"number of control steps (dt = {dt:g} s) in {seconds:.4g} s"
@@ -199,45 +183,35 @@ def line_target(
 
     Raises:
         GroundedError: for an unknown state, a line of zero length, an ambiguous axis, a duration
-            that is not positive, or a velocity of what the line
-            moves that is not to end at 0.
+            that is not positive, or a velocity of what the line moves that is not to end at 0.
     """
     _check(drive)
     to = to or {(name := _axis(model)): start.get(name, 0.0) + drive.size}
     _check_states(to, model)
-    if not {*to} <= {*velocities_of(model)}:  # else they are what is moved
-        to = _placed(to, model, at_rest=True)
+    still = {*to} <= {*velocities_of(model)}  # they are what is moved
+    to = to if still else _placed(to, model, at_rest=True)
     way = {name: value - start.get(name, 0.0) for name, value in to.items()}
-    length = max(map(abs, way.values()))
+    length, rates, place = max(map(abs, way.values())), rate_states(model), position_names(model)
     if not 0 < length < np.inf:
         there = ", ".join(f"{name} = {value:g}" for name, value in to.items())
-        still = {*to} <= {*velocities_of(model)}
-        goes = next((q for q in (*position_names(model), *rate_states(model)) if q not in to), "")
+        goes = next((q for q in (*place, *rates) if q not in to), "")
         raise wrong("--to", got=there, must="way", like=f"{goes}=1.0" if still and goes else None)
     if seconds is not None:
-        drive = _in_time(drive, length, seconds)
+        # as gently as `drive`, at the least it accelerates to the middle, then decelerates
+        positive("--seconds", seconds)
+        accel = max(drive.accel, 4 * length / seconds**2)
+        root = np.sqrt(max((accel * seconds) ** 2 - 4 * accel * length, 0.0))
+        drive = replace(drive, accel=accel, speed=float(accel * seconds - root) / 2)
         _grid(seconds + drive.hold, dt)
-    along = np.linspace(0, length, FINE)
-    limit = np.full(FINE, drive.speed)
+    along, limit = np.linspace(0, length, FINE), np.full(FINE, drive.speed)
     limit[-1] = 0.0
     speed = _reachable(along, limit, drive.accel)
     t, share, rate = _driven(along, speed, drive.hold, dt, seconds)
-    share, rate = share / length, rate / length
-    columns = {name: start.get(name, 0.0) + share * far for name, far in way.items()}
-    rates, place = rate_states(model), position_names(model)
+    columns = {name: start.get(name, 0.0) + share / length * far for name, far in way.items()}
     way |= dict.fromkeys([q for q in place if q not in way and not {*place}.isdisjoint(way)], 0.0)
     columns |= {q: np.full(len(t), start.get(q, 0.0)) for q in way if q not in columns}
-    columns |= {rates[q]: rate * far for q, far in way.items() if rates.get(q, q) not in way}
-    return columns
-
-
-def _in_time(drive: Drive, length: float, seconds: float) -> Drive:
-    """Return the drive that covers a line in `seconds`, as gently as `drive` if it can."""
-    positive("--seconds", seconds)
-    # at the least it accelerates to the middle, then decelerates
-    accel = max(drive.accel, 4 * length / seconds**2)
-    root = np.sqrt(max((accel * seconds) ** 2 - 4 * accel * length, 0.0))
-    return replace(drive, accel=accel, speed=float(accel * seconds - root) / 2)
+    pace = rate / length
+    return columns | {rates[q]: pace * far for q, far in way.items() if rates.get(q, q) not in way}
 
 
 def has_plane(model: Model) -> bool:
@@ -286,11 +260,7 @@ def step_target(
     seconds: float,
     start: Mapping[str, float] = MappingProxyType({}),
 ) -> dict[str, Array]:
-    """Return columns with given values from the second row on; the first row is `start`, or 0.
-
-    Raises:
-        GroundedError: for an unknown state, without a state, or for an unusable number of steps.
-    """
+    """Return columns with given values from the second row on; the first row is `start`, or 0."""
     if not to:
         raise wrong("--to", must="given", like="--to x=1.0")
     rows = in_steps(seconds, dt, np.round(seconds / dt)) + 1

@@ -13,32 +13,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-SOURCE = '''"""{text}.
-
-A skeleton written by `grounded init --from`: change it to match your robot.
-"""
-
-{numpy}from grounded import Model, Param
-
-
-def dynamics(s, a, p):
-    """ds/dt."""
-{before}    return {{
-{lines}    }}
-
-
-# Param(value, unit) is a constant; `fit` may change one that has bounds.
-model = Model(
-    name="{kind}",
-    states={states},
-    inputs={inputs},
-    params={{
-{params}    }},
-    angles={angles!r},
-    roles={roles!r},
-    derivative=dynamics,
-)
-'''
+from grounded_trials.starting import template
 
 
 @dataclass(frozen=True)
@@ -58,7 +33,7 @@ class Skeleton:
     def source(self) -> str:
         """Return the text of model.py."""
         uses = any("np." in line for line in (*self.lines, *self.before))
-        return SOURCE.format(
+        return template("model.py").format(
             text=self.text,
             numpy="import numpy as np\n\n" * uses,
             before="".join(f"    {line}\n" for line in self.before),
