@@ -13,14 +13,15 @@ from __future__ import annotations
 import zlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from struct import Struct
+from typing import Any
 
 import numpy as np
 
-from grounded.checks import wrong
-from grounded.errors import GroundedError
+from grounded.checks import refused, wrong
 from grounded.findings import Finding, found
 from grounded.result import UNSAID, Document
 from grounded_trials.formats.bad import BadRecord
@@ -69,19 +70,18 @@ class Recovery(Document):
 
 
 def recover_log(source: str | Path, target: str | Path) -> Recovery:
-    """Write what can be saved of a log to a new file.
+    """Write what can be saved of a log to a new file; refuse if that is nothing.
 
     Raises:
-        GroundedError: if nothing can be saved, `source` can't be read, or `target` can't be
-            written.
+        GroundedError: also if `source` can't be read, or `target` can't be written.
     """
     source, target = Path(source), Path(target)
     if target.exists():
-        raise GroundedError(found("file.exists", str(target)))
+        raise refused("file.exists", target)
     if target.suffix.lower() != ".mcap":
         raise wrong("name of the copy", str(target), like="copy.mcap")
     if not target.parent.is_dir():
-        raise GroundedError(found("file.unwritable", str(target), folder=str(target.parent)))
+        raise refused("file.unwritable", target, folder=str(target.parent))
     with open_log(source) as stream:
         size = stream.seek(0, 2)
     if not size:
@@ -137,11 +137,9 @@ def _recover(source: Path, target: Path) -> Recovery:
                 copy.finish()
         sync_folder(target.parent)
     except OSError as error:
-        raise GroundedError(
-            found("file.unwritable", str(target), why=str(error.strerror))
-        ) from error
+        raise refused("file.unwritable", target, why=str(error.strerror)) from error
     if not anything:
-        raise GroundedError(found("file.no_message", str(source)))
+        raise refused("file.no_message", source)
 
     # What was lost.
     losses = salvage.losses[:MOST_LOSSES]
@@ -181,20 +179,13 @@ _SPAN = Struct("<QQ")  # a chunk's first and last time
 
 
 class Salvage:
-    """One pass over a damaged file, up to the first record whose head can't be one.
-
-    Attributes:
-        losses: what was lost.
-        lost_messages: messages in dropped chunks by channel, according to the indexes.
-        dropped: first and last time stated in each dropped chunk [ns].
-    """
+    """One pass over a damaged file, up to the first record whose head can't be one."""
 
     def __init__(self, data: Data) -> None:
         self.data, self.size = data, len(data)
         self.losses: list[Finding] = []
-        self.lost_messages: Counter[int] = Counter()
-        self.dropped: list[tuple[int, int]] = []
-        self._crc = zlib.crc32(MAGIC)
+        self.lost_messages: Counter[int] = Counter()  # in dropped chunks, as the indexes say
+        self.dropped: list[tuple[int, int]] = []  # first and last time that each states [ns]
         self._outside = 0  # messages outside checked chunks, covered only by the data checksum
         self._tables = 0  # metadata and attachments covered only by it
         self._ended = False  # the data section has ended; only the index follows
@@ -204,12 +195,12 @@ class Salvage:
     def records(self) -> Iterator[Record]:
         """Yield what can be saved, in file order."""
         if self.data[:8] != MAGIC:
-            self.losses.append(found("file.lost", part="its beginning"))
+            self._lose(part="its beginning")
         pos, before, dropped_chunk = len(MAGIC), 0, False  # the kind of the record before
         while (stop := self._end_of(pos)) is not None:
-            opcode, end = self.data[pos], stop
+            opcode, content, kept = self.data[pos], self.data[pos + 9 : stop], len(self.losses)
             if opcode == Op.MESSAGE and (self._ended or before in (Op.CHUNK, Op.MESSAGE_INDEX)):
-                self.losses.append(found("file.lost", part=record_name(Op.MESSAGE), byte=pos))
+                self._lose(part=record_name(Op.MESSAGE), byte=pos)
             elif opcode == Op.MESSAGE:  # a run of messages outside chunks
                 while (further := self._end_of(stop)) and self.data[stop] == Op.MESSAGE:
                     stop = further
@@ -218,25 +209,28 @@ class Salvage:
                 self._outside += len(positions)
                 yield from self._sound(batch(run, positions))
             elif opcode == Op.FOOTER:
-                if self.data[end : end + 9] != MAGIC:
-                    self.losses.append(found("file.lost", part="its end"))
+                if self.data[stop : stop + 9] != MAGIC:
+                    self._lose(part="its end")
                 return
             else:
-                content, kept = self.data[pos + 9 : end], len(self.losses)
                 if opcode == Op.DATA_END:
-                    self._data_end(content)
-                if opcode == Op.MESSAGE_INDEX and dropped_chunk:
-                    self._count_lost(content)
+                    self._data_end(pos, content)
+                elif opcode == Op.MESSAGE_INDEX and dropped_chunk and len(content) >= 6:
+                    channel, size = Struct("<HI").unpack_from(content)
+                    self.lost_messages[channel] += size // 16
                 yield from self._record(opcode, content, pos)
                 dropped_chunk &= opcode == Op.MESSAGE_INDEX
                 dropped_chunk |= opcode == Op.CHUNK and len(self.losses) > kept
                 before = opcode
-            self._crc, pos = zlib.crc32(self.data[pos:stop], self._crc), stop
+            pos = stop
         yield from self._cut(self.data[pos:])
         if self.data[-len(MAGIC) :] == MAGIC:  # the file is whole, the record's head is not
-            self.losses.append(found("file.lost", bytes=self.size - pos, byte=pos))
+            self._lose(bytes=self.size - pos, byte=pos)
         else:
             self.losses.append(found("file.cut", byte=self.size, index=int(self._ended)))
+
+    def _lose(self, **facts: Any) -> None:
+        self.losses.append(found("file.lost", **facts))
 
     def _record(self, opcode: int, content: bytes, pos: int) -> Iterator[Record]:
         try:
@@ -250,8 +244,7 @@ class Salvage:
                 self._tables += opcode in (Op.METADATA, Op.ATTACHMENT)
                 yield from self._sound(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
-            what = record_name(opcode)
-            self.losses.append(found("file.lost", part=what, byte=pos, why=error.finding.what))
+            self._lose(part=record_name(opcode), byte=pos, why=error.finding.what)
             if opcode == Op.CHUNK and len(content) >= 16:
                 self.dropped.append(_SPAN.unpack_from(content))
 
@@ -270,23 +263,17 @@ class Salvage:
         elif isinstance(record, Messages):
             good = (record.log_times >= 0) & ~np.isin(record.channels, list(self._doubtful))
             if not good.all():
-                self.losses.append(found("file.lost", messages=int((~good).sum())))
+                self._lose(messages=int((~good).sum()))
                 record = record.take(good)
             if not len(record):
                 return
         yield record
 
-    def _data_end(self, content: bytes) -> None:
-        stated = int.from_bytes(content[:4], "little")
-        wrong = bool(stated) and stated != self._crc
+    def _data_end(self, pos: int, content: bytes) -> None:
+        stated, self._ended = int.from_bytes(content[:4], "little"), True
+        wrong = bool(stated) and stated != zlib.crc32(memoryview(self.data)[:pos])
         if wrong and not self.losses and (self._outside or self._tables):
-            self.losses.append(found("file.lost", wrong=True, messages=self._outside))
-        self._ended = True
-
-    def _count_lost(self, content: bytes) -> None:
-        if len(content) >= 6:
-            channel, size = Struct("<HI").unpack_from(content)
-            self.lost_messages[channel] += size // 16
+            self._lose(wrong=True, messages=self._outside)
 
     def _end_of(self, pos: int) -> int | None:
         """Return where the record there ends; None if there can't be one."""
@@ -299,13 +286,11 @@ class Salvage:
 
     def _cut(self, rest: bytes) -> Iterator[Record]:
         """Yield the intact parts of the record in which the file ends."""
-        try:
-            if len(rest) > 49 and rest[0] == Op.CHUNK:
+        if len(rest) > 49 and rest[0] == Op.CHUNK:
+            with suppress(BadRecord):
                 fields = Fields(rest[9 + 16 :])
                 size, _, compression = fields.uint(64), fields.skip(4), fields.text()
                 packed = fields.content[fields.pos + 8 :]
                 data = decompress(compression, bytes(packed), size)[0]
                 for record in list(chunk_records(data, cut=True)):
                     yield from self._sound(record)
-        except BadRecord:
-            pass

@@ -46,26 +46,19 @@ from grounded_trials.workspace.user_files.config import set_keys
 from grounded_trials.workspace.user_files.task_file import read_target
 
 
-def recorded_run(workspace: Folder, file: str, shapes: Sequence[str]) -> dict[str, Array]:
+def recorded_run(workspace: Folder, file: str) -> dict[str, Array]:
     """Return the states of a recorded run as a target.
 
-    Args:
-        workspace: provides the model, [log] and the stored trials.
-        file: a stored trial, t0001; a trial file; a log in any format; or a CSV with columns `t`
-            and states.
-        shapes: names of the shapes, suggested if the file does not exist.
-
-    Raises:
-        GroundedError: if there is no such file, or it can't be sampled.
+    The file is a stored trial, t0001; a trial file; a log in any format; or a CSV with columns `t`
+    and states. One that does not exist, or can't be sampled, is refused.
     """
     model, path = workspace.base_model, Path(file)
     if not path.exists():
         if file.lower() in workspace.discarded():
             raise unknown_trial(workspace, file)
-        stored = {one.id: one.path for one in workspace.store.list()}
-        path = stored.get(file.lower(), path)
+        path = {one.id: one.path for one in workspace.store.list()}.get(file.lower(), path)
     if not path.exists():
-        raise unknown("file or shape", file, shapes)
+        raise unknown("file or shape", file, SHAPES)
     if path.is_file() and format_of(path) == TRIAL:
         trial, _, _ = read_trial(path)
         trial = trial.until(max(trial.finite_steps, 0))
@@ -108,21 +101,13 @@ Weights = dict[str, dict[str, float]]  # by kind (state, terminal, input_change)
 
 @dataclass(frozen=True)
 class Manoeuvre:
-    """A manoeuvre as a person asks for it.
+    """A manoeuvre as a person asks for it."""
 
-    Args:
-        shape: one of `shapes.SHAPES`, a stored trial, or a file of a log or of columns.
-        drive: size and pace of a path.
-        to: where states end, or what they keep along a path.
-        seconds: duration of a step or a line to a state; None: 5 s, or by the pace.
-        rest: whether the states that a line leaves free rest at its end.
-    """
-
-    shape: str
-    drive: Drive = field(default_factory=Drive)
-    to: Mapping[str, float] = field(default_factory=dict)
-    seconds: float | None = None
-    rest: bool = False
+    shape: str  # one of `shapes.SHAPES`, a stored trial, or a file of a log or of columns
+    drive: Drive = field(default_factory=Drive)  # size and pace of a path
+    to: Mapping[str, float] = field(default_factory=dict)  # where states end, or what they keep
+    seconds: float | None = None  # of a step or a line to a state; None: 5 s, or by the pace
+    rest: bool = False  # whether the states that a line leaves free rest at its end
 
     @property
     def is_path(self) -> bool:
@@ -132,31 +117,20 @@ class Manoeuvre:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Drawn(Document):
-    """What was drawn.
+    """What was drawn."""
 
-    Args:
-        path: the file of the target.
-        ranges: lowest and highest value of the column of each tracked state.
-        horizon: number of control steps H.
-        units: of the model's states.
-        dt: control interval [s].
-        free: states without a column.
-        driven: highest speed [m/s] and smallest turning radius [m] of a path, NaN and inf if none.
-        weights: what is new in [reward].
-        findings: what is told, the heaviest first.
-        then: the command to type next.
-    """
-
-    path: Path = field(metadata={"key": "target"})
+    path: Path = field(metadata={"key": "target"})  # the file of the target
+    # lowest and highest value of the column of each tracked state
     ranges: Mapping[str, tuple[float, float]] = field(metadata={"key": "columns"})
-    horizon: int
-    units: Mapping[str, str] = field(metadata=UNSAID)
-    dt: float = field(metadata=UNSAID)
-    free: tuple[str, ...]
+    horizon: int  # number of control steps H
+    units: Mapping[str, str] = field(metadata=UNSAID)  # of the model's states
+    dt: float = field(metadata=UNSAID)  # control interval [s]
+    free: tuple[str, ...]  # states without a column
+    # highest speed [m/s] and smallest turning radius [m] of a path, NaN and inf if none
     driven: tuple[float, float] = field(metadata=UNSAID)
-    weights: Weights = field(metadata=UNSAID)
-    findings: tuple[Finding, ...]
-    then: NextCommand = field(metadata=UNSAID)
+    weights: Weights = field(metadata=UNSAID)  # what is new in [reward]
+    findings: tuple[Finding, ...]  # what is told, the heaviest first
+    then: NextCommand = field(metadata=UNSAID)  # the command to type next
 
 
 def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
@@ -170,17 +144,13 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
     model, old = workspace.base_model, workspace.config.task
     start, before = old.start or rest, _reward(workspace)
 
-    # Its columns; those of a log know their own start.
+    # Its columns, those of a log know their own start; and the files.
     columns = _columns(workspace, asked, start)
-    if asked.shape not in SHAPES:
-        rest = {}
+    extra: tuple[Any, ...] = ()
+    rest = rest if asked.shape in SHAPES else {}
     line = asked.rest and asked.shape == "line"
-    rests = rest_at_end(workspace, columns, start) if line else None
-    if rests is not None:
-        columns = {**columns, **rests.columns}
-
-    # The files.
-    extra = () if rests is None else (rests.weights, [*rests.columns])
+    if line and (rests := rest_at_end(workspace, columns, start)) is not None:
+        columns, extra = {**columns, **rests.columns}, (rests.weights, [*rests.columns])
     path = replace_target(workspace.config, columns, model, *extra)
     if rest:
         set_keys(workspace.config.file, "task", start=rest)
@@ -219,7 +189,7 @@ def _columns(workspace: Folder, asked: Manoeuvre, start: Mapping[str, float]) ->
         raise GroundedError(found("given.either", "--seconds", shape, how="one"))
     if asked.is_path:
         return path_target(shape, asked.drive, model, dt, asked.to, start)
-    return recorded_run(workspace, shape, SHAPES)
+    return recorded_run(workspace, shape)
 
 
 def _reward(workspace: Folder) -> Weights:

@@ -49,15 +49,11 @@ class OwnModel:
 
     def missing(self, folder: Path) -> tuple[str, ...]:
         """Return the names of the files that a folder does not have yet."""
-        files = {FILE: self.file} | dict(self.others)
+        files = {FILE: self.file, **self.others}
         return tuple(name for name, path in files.items() if not _there(folder / name, path))
 
     def bring(self, folder: Path) -> Model:
-        """Write the missing files to a folder, and load the model from there.
-
-        Raises:
-            GroundedError: if it does not load from that folder.
-        """
+        """Write the missing files to a folder, and load the model from there."""
         for name in self.missing(folder):
             made_folder((folder / name).parent)
             data = self.source if name == FILE else self.others[name].read_bytes()
