@@ -53,11 +53,7 @@ def _batch(parts: Sequence[bytes], channels: ArrayLike, times: ArrayLike) -> Mes
 
 
 def sqlite_records(path: Path) -> Iterator[Record]:
-    """Yield the records of a ROS 2 `.db3` file.
-
-    Raises:
-        GroundedError: if it is not a bag.
-    """
+    """Yield the records of a ROS 2 `.db3` file."""
     import sqlite3
 
     waiting = path.with_name(path.name + "-wal").exists()  # left by a recorder that was killed

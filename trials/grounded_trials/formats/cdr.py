@@ -40,9 +40,6 @@ def columns(
         name: of their type.
         types: the fields of each type, as rosbags parses them.
         classes: those of rosbags, by type.
-
-    Raises:
-        Uneven: if they are not of one form.
     """
     block = _Block(rows, types, classes)
     message = block.of_type(name)

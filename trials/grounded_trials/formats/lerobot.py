@@ -35,11 +35,7 @@ def is_episode(path: Path) -> bool:
 
 
 def episodes(folder: Path) -> list[Path]:
-    """Return the paths of a data set's episodes, in order.
-
-    Raises:
-        GroundedError: if its meta/info.json can't be used.
-    """
+    """Return the paths of a data set's episodes, in order."""
     return [folder / f"episode_{k:06d}" for k in range(int(info_of(folder)["total_episodes"]))]
 
 
@@ -51,11 +47,7 @@ def episode_files(path: Path) -> list[Path]:
 
 
 def info_of(folder: Path) -> dict[str, Any]:
-    """Return meta/info.json with all that is read of it.
-
-    Raises:
-        GroundedError: if something is missing.
-    """
+    """Return meta/info.json with all that is read of it."""
     path = folder / "meta" / "info.json"
     try:
         info = json.loads(read_file(path, INFO_LIMIT))

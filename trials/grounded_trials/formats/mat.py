@@ -53,11 +53,7 @@ def mat_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
 
 
 def mat73_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
-    """Return the tables of a MATLAB file of version 7.3.
-
-    Raises:
-        GroundedError: if it holds nothing but objects of MATLAB's own classes.
-    """
+    """Return the tables of a MATLAB file of version 7.3."""
     import h5py
 
     with h5py.File(path, "r") as file:

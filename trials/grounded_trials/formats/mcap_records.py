@@ -255,11 +255,7 @@ PARSERS: dict[int, Callable[[Fields], Record]] = {
 
 
 def chunk_content(content: bytes | memoryview, *, packed: bool = True) -> tuple[bytes, bool]:
-    """Return the decompressed records of a chunk, and whether it has a checksum.
-
-    Raises:
-        BadRecord: for a wrong checksum or size, another compression, or damaged content.
-    """
+    """Return the decompressed records of a chunk, and whether it has a checksum."""
     try:
         size, crc, length = _CHUNK.unpack_from(content)
         name, start = bytes(content[32 : 32 + length]), 40 + length

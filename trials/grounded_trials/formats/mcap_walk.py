@@ -235,11 +235,7 @@ class Part:
 
 
 def by_topic(records: Iterable[Record], name: str) -> Iterator[Record | Topic | Part]:
-    """Yield records with topics in place of schemas and channels, and messages with theirs.
-
-    Raises:
-        DamagedFile: for messages whose channel is not defined.
-    """
+    """Yield records with topics in place of schemas and channels, and messages with theirs."""
     schemas, topics = dict[int, Schema](), dict[int, Topic]()
     for record in records:
         if isinstance(record, Schema):
@@ -272,9 +268,6 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
     Args:
         data: the chunk's content.
         cut: its end is missing: stop at the first incomplete record.
-
-    Raises:
-        BadRecord: if the records do not fit the chunk.
     """
     positions, pos, end = list[int](), 0, len(data)
     while pos < end:
@@ -295,11 +288,7 @@ def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channe
 
 
 def message_positions(buffer: bytes, pos: int, end: int) -> tuple[list[int], int]:
-    """Return the starts of consecutive message records from `pos` on, and their end.
-
-    Raises:
-        BadRecord: for a message that is shorter than its header.
-    """
+    """Return the starts of consecutive message records from `pos` on, and their end."""
     positions: list[int] = []
     append, unpack, message = positions.append, RECORD_HEAD.unpack_from, int(Op.MESSAGE)
     while end - pos >= 9:

@@ -98,11 +98,7 @@ _EXPECTED = {  # by the first character of what can't be read
 
 
 def parse_path(text: str) -> MessagePath:
-    """Parse a message path.
-
-    Raises:
-        GroundedError: if it is invalid, stating the character.
-    """
+    """Parse a message path."""
     return _parsed(text) if isinstance(text, str) else _fail(str(text), 0, "/topic.field")
 
 

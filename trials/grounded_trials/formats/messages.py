@@ -41,11 +41,7 @@ class Decoded:
 
     @cached_property
     def objects(self) -> Sequence[Any]:
-        """The messages one by one.
-
-        Raises:
-            BadMessage: for one that is not of its type.
-        """
+        """The messages one by one."""
         return [self.message(i) for i in range(len(self.log_times))]
 
     def message(self, i: int) -> Any:
@@ -121,11 +117,7 @@ def _nested(columns: dict[str, Floats]) -> dict[str, Any]:
 
 
 def decoder_of(channel: Channel, schema: Schema | None) -> Decoder:
-    """Return the decoder of a channel.
-
-    Raises:
-        BadSchema: if its encoding is not one of cdr, ros1, protobuf, json, or its schema is bad.
-    """
+    """Return the decoder of a channel."""
     encoding, name = channel.encoding, schema.name if schema else ""
     if encoding in ("json", "table"):
         return Decoder(name or encoding, json.loads)
@@ -192,11 +184,7 @@ _NOT_PLAIN = re.compile(
 
 
 def _ros(schema: Schema, encoding: str) -> Decoder:
-    """Return the decoder of the messages of a ROS definition.
-
-    Raises:
-        BadSchema: if rosbags can't use it.
-    """
+    """Return the decoder of the messages of a ROS definition."""
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 
     text = schema.data.decode("utf-8", "replace").replace("\r\n", "\n")

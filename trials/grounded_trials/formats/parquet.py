@@ -44,11 +44,7 @@ def parquet_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
 
 
 def episode_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
-    """Return the features of an episode, FOLDER/episode_000003, a table each.
-
-    Raises:
-        GroundedError: if the data set's meta/info.json can't be used, or it has no such episode.
-    """
+    """Return the features of an episode, FOLDER/episode_000003, a table each."""
     folder, number = path.parent, int(path.name.partition("_")[2])
     info = info_of(folder)
     file = _file_of(folder, info, number)

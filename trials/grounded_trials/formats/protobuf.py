@@ -127,9 +127,6 @@ def numbers_in(schema: Schema) -> dict[str, tuple[int, bool]]:
     """Return the keys of a message type's numbers, and whether they are lists, by their names.
 
     A definition of ours is known without the library, verified by writing it again.
-
-    Raises:
-        BadSchema: if the definition can't be used.
     """
     own = _OWN_FIELD.findall(schema.data)
     names = [name.decode("utf-8", "replace") for name, _ in own]
@@ -155,9 +152,6 @@ def message_class(definition: bytes, name: str) -> Any:
     """Return the class of the messages `name` of a serialised FileDescriptorSet.
 
     Its fields have the names of `spelled`, since the library takes ASCII names only.
-
-    Raises:
-        BadSchema: if the library can't use it.
     """
     from google.protobuf import descriptor_pool, message_factory
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet

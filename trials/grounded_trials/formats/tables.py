@@ -64,11 +64,7 @@ AS_IT_SAYS = Layout()
 
 
 def columns_by_name(columns: Iterable[tuple[str, C]], path: Path) -> dict[str, C]:
-    """Return columns by their names, which no two may share; one without a name is left out.
-
-    Raises:
-        GroundedError: if two have the same name: which one it means would be unclear.
-    """
+    """Return columns by their names, which no two may share; one without a name is left out."""
     by_name: dict[str, C] = {}
     for name, column in columns:
         if name in by_name:
@@ -84,9 +80,6 @@ def npz_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     `NAME` (N, k) with `NAME_t` (N,) becomes the table /NAME, its columns named by an array of k
     texts if there is one; arrays (N,) with a time of that length become the table /npz. With a
     rate, the longest array and those of its length are that.
-
-    Raises:
-        GroundedError: if it is an exported candidate.
     """
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -164,9 +157,6 @@ def table_records(
         kind: of the file, such as "csv".
         path: of the file, for messages.
         rate: of the rows [Hz], whatever times they have; 0: a column has their times.
-
-    Raises:
-        GroundedError: if there is no table, or no column of times and no rate.
     """
     if not tables:
         raise GroundedError(found("file.no_times", str(path)))

@@ -55,11 +55,7 @@ class _Head:
 
 
 def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
-    """Return the numbers of a text table: a row of names, unless the layout has them, then rows.
-
-    Raises:
-        GroundedError: if names or times are missing, or a row has a wrong number of cells.
-    """
+    """Return the numbers of a text table: a row of names, unless the layout has them, then rows."""
     lines = _lines(path)
     head = _head_by(layout.columns, lines, path) if layout.columns else _head(lines, path)
     time = "" if layout.rate else _times_among(head, path)
@@ -166,11 +162,7 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
 
 
 def _head_by(columns: Sequence[str], lines: Sequence[str], path: Path) -> _Head:
-    """Return the head of a table whose first row of numbers has these columns.
-
-    Raises:
-        GroundedError: if it has another number of them.
-    """
+    """Return the head of a table whose first row of numbers has these columns."""
     lines = lines[: PREAMBLE + 2]
     marks = [next((m for m in "\t;," if m in line), ",") for line in lines]
     rows = [_filled(_cells(line, mark)) for line, mark in zip(lines, marks, strict=True)]
@@ -218,11 +210,7 @@ def _share(cells: Sequence[str]) -> float:
 
 
 def _times_among(head: _Head, path: Path) -> str:
-    """Return the name of the column of times.
-
-    Raises:
-        GroundedError: if there is none.
-    """
+    """Return the name of the column of times."""
     if named := time_among(head.names):
         return named
     if date := next((name for name in head.names if name.lower() in DATES), ""):

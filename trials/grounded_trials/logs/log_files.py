@@ -135,11 +135,7 @@ def read_apart(
     *args: P.args,
     **kwargs: P.kwargs,
 ) -> T:
-    """Return function(files, ...) for the files of a log, computed in a child process.
-
-    Raises:
-        GroundedError: as `log_files` and `within`.
-    """
+    """Return function(files, ...) for the files of a log, computed in a child process."""
     files = log_files(paths)
     size = sum(one.stat().st_size for file in files for one in on_disk(file))
     for file in files:  # the memory of a library is then not counted as the file's
@@ -157,11 +153,7 @@ def _load(format: Format | None) -> None:
 
 
 def digest_of(log: Path) -> str:
-    """Return the SHA-256 of what is read of an episode, whatever else its files hold.
-
-    Raises:
-        GroundedError: if it can't be read.
-    """
+    """Return the SHA-256 of what is read of an episode, whatever else its files hold."""
     return read_apart(log, _digest)
 
 

@@ -31,9 +31,6 @@ def logs_in(path: Path) -> list[Path]:
 
     The runs are the episodes of a LeRobot data set, or the files of a folder that is no bag, if
     its tables have equally many columns.
-
-    Raises:
-        GroundedError: if the data set can't be used.
     """
     if not path.is_dir():
         return [path]
@@ -133,11 +130,7 @@ def _missing(path: Path) -> GroundedError:
 
 
 def open_log(path: Path) -> BinaryIO:
-    """Open a log for reading.
-
-    Raises:
-        GroundedError: if it can't be opened, or is not a regular file (a pipe, a device).
-    """
+    """Open a log for reading."""
     try:
         return open_file(path)
     except FileNotFoundError:

@@ -32,11 +32,7 @@ LATEST_S = 1e-9 * LATEST
 
 
 def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> LogMapping | None:
-    """Parse the [log] table; None if there is none.
-
-    Raises:
-        GroundedError: for an unknown key or name, or a value of the wrong kind.
-    """
+    """Parse the [log] table; None if there is none."""
     if not table.values:
         return None
     table.expect(("clock", "state", "input", "span", "columns", "rate"))
@@ -49,11 +45,7 @@ def log_mapping(table: Table, states: Sequence[str], inputs: Sequence[str]) -> L
 
 
 def layout_of(table: Table) -> Layout:
-    """Return the names and the rate of tables that do not say them, `columns` and `rate`.
-
-    Raises:
-        GroundedError: for values of the wrong kind.
-    """
+    """Return the names and the rate of tables that do not say them, `columns` and `rate`."""
     columns = table.take("columns", list, [])
     if not all(isinstance(name, str) and name for name in columns):
         raise table.error("columns", "list", columns)
@@ -154,11 +146,7 @@ def mapped_signals(
     states: Sequence[str],
     inputs: Sequence[str],
 ) -> dict[str, Series]:
-    """Return the raw samples of a log's states and inputs, and of the signals for its span.
-
-    Raises:
-        GroundedError: see `signals.read_signals`.
-    """
+    """Return the raw samples of a log's states and inputs, and of the signals for its span."""
     if missing := ["state"] * (not states) + ["input"] * (not inputs):
         raise refused("log.no_signal", *missing, what="any")
     paths_of = {mapping.states[name].path: name for name in states}

@@ -70,11 +70,7 @@ class Recovery(Document):
 
 
 def recover_log(source: str | Path, target: str | Path) -> Recovery:
-    """Write what can be saved of a log to a new file; refuse if that is nothing.
-
-    Raises:
-        GroundedError: also if `source` can't be read, or `target` can't be written.
-    """
+    """Write what can be saved of a log to a new file; refuse if that is nothing."""
     source, target = Path(source), Path(target)
     if target.exists():
         raise refused("file.exists", target)
