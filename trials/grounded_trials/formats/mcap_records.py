@@ -28,25 +28,11 @@ PIECE = 2**17  # [bytes] decompressed at once; what comes before an error is kep
 _U64 = struct.Struct("<Q")
 
 
-class Op(IntEnum):
-    """What a record is."""
-
-    HEADER = 1
-    FOOTER = 2
-    SCHEMA = 3
-    CHANNEL = 4
-    MESSAGE = 5
-    CHUNK = 6
-    MESSAGE_INDEX = 7
-    CHUNK_INDEX = 8
-    ATTACHMENT = 9
-    ATTACHMENT_INDEX = 10
-    STATISTICS = 11
-    METADATA = 12
-    METADATA_INDEX = 13
-    SUMMARY_OFFSET = 14
-    DATA_END = 15
-
+Op = IntEnum(
+    "Op",
+    "HEADER FOOTER SCHEMA CHANNEL MESSAGE CHUNK MESSAGE_INDEX CHUNK_INDEX ATTACHMENT "
+    "ATTACHMENT_INDEX STATISTICS METADATA METADATA_INDEX SUMMARY_OFFSET DATA_END",
+)
 
 _NAMES: dict[int, str] = {
     Op.HEADER: "the header",

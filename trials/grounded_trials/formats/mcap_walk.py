@@ -65,11 +65,10 @@ class DamagedFile(GroundedError):
         self, name: str, offset: int, what: str, part: str = "", why: str = "", lost: bool = False
     ) -> None:
         self.offset, self.what = offset, what
-        facts: dict[str, Any] = {"what": what, "part": part, "why": why}
+        facts: dict[str, Any] = {"byte": offset, "what": what, "part": part, "why": why}
         then = None if lost else NextCommand("recover", (name,))
-        code = "file.no_message" if lost else "file.damaged"
-        code = "file.no_log" if what == "other" else code
-        super().__init__(found(code, name, then=then, byte=offset, **facts))
+        code = "no_log" if what == "other" else "no_message" if lost else "damaged"
+        super().__init__(found(f"file.{code}", name, then=then, **facts))
 
 
 def mapped(stream: BinaryIO) -> Data:
@@ -90,7 +89,7 @@ def read_records(data: Data, name: str, *, packed: bool = True) -> Iterator[Reco
     Raises:
         DamagedFile: if it is not a complete, undamaged MCAP file.
     """
-    yield from _Walk(data, name, packed).records()
+    return _Walk(data, name, packed).records()
 
 
 class _Walk:
@@ -104,15 +103,11 @@ class _Walk:
         self.defined: dict[tuple[type, int], Schema | Channel] = {}
         self.messages = False  # a message, or a chunk of them, has begun
 
-    def damaged(
-        self, what: str, part: str = "", why: str = "", offset: int | None = None
-    ) -> DamagedFile:
-        at = self.pos if offset is None else offset
-        return DamagedFile(self.name, at, what, part, why)
+    def damaged(self, what: str, part: str, why: str = "", at: int | None = None) -> DamagedFile:
+        return DamagedFile(self.name, self.pos if at is None else at, what, part, why)
 
-    def checksum(self, start: int) -> int:
-        """Return the CRC from `start` to here."""
-        return zlib.crc32(memoryview(self.data)[start : self.pos])
+    def checksum(self, start: int, end: int) -> int:
+        return zlib.crc32(memoryview(self.data)[start:end])
 
     def need(self, count: int, what: str) -> None:
         """Check that the file has so many bytes more; before its first message none is saved."""
@@ -120,41 +115,38 @@ class _Walk:
             raise DamagedFile(self.name, self.size, "cut", what, lost=not self.messages)
 
     def records(self) -> Iterator[Record]:
-        self._magic()
+        if (head := self.data[:8]) != MAGIC:
+            what = "empty" if not head else "cut" if MAGIC.startswith(head) else "other"
+            raise DamagedFile(self.name, 0, what, "its first 8 bytes", lost=True)
+        self.pos = 8
         while True:
             self.need(9, "a record's head")
             opcode, length = RECORD_HEAD.unpack_from(self.data, self.pos)
             self.messages |= opcode in (Op.CHUNK, Op.MESSAGE)
             self.need(9 + length, record_name(opcode))
-            if self.data_crc is None and opcode in PARSED:
-                if opcode == Op.MESSAGE:
-                    yield self._sound(self._run_of_messages(9 + length))
-                    continue
-            elif opcode not in (Op.DATA_END, Op.FOOTER):  # an index, or part of the summary
-                self.pos += 9 + length
+            at, start, end = self.pos, self.pos + 9, self.pos + 9 + length
+            if opcode == Op.MESSAGE and self.data_crc is None:
+                yield self._sound(self._run_of_messages(9 + length))
                 continue
-            at, start = self.pos, self.pos + 9
-            content = memoryview(self.data)[start : start + length]
-            if opcode == Op.DATA_END and self.data_crc is None:
-                self._data_end(content)
-            elif opcode == Op.FOOTER:
-                self._footer(content)
+            if opcode == Op.FOOTER:
+                self._footer(start, end)
                 yield End(bool(self.data_crc))
                 return
-            self.pos = start + length
-            if self.data_crc is None:
-                yield from self._data_record(opcode, content, at)
-
-    def _magic(self) -> None:
-        if (head := self.data[:8]) != MAGIC:
-            what = "empty" if not head else "cut" if MAGIC.startswith(head) else "other"
-            raise DamagedFile(self.name, 0, what, "its first 8 bytes", lost=True)
-        self.pos = 8
+            if self.data_crc is None and (opcode in PARSED or opcode == Op.DATA_END):
+                content = memoryview(self.data)[start:end]
+                if opcode == Op.DATA_END:
+                    stated = Fields(content).uint(32) if length >= 4 else 0
+                    if stated and stated != self.checksum(0, at):
+                        raise self.damaged("checksum", "the data section")
+                    self.data_crc, self.summary = bool(stated), end
+                else:
+                    self.pos = end
+                    yield from self._data_record(opcode, content, at)
+            self.pos = end  # also behind an index, or a part of the summary
 
     def _run_of_messages(self, first: int) -> Messages:
         """Return consecutive message records: a block of them, at least the first."""
-        start, end = self.pos, min(self.size, self.pos + max(first, BLOCK))
-        block = self.data[start:end]
+        block = self.data[self.pos : self.pos + max(first, BLOCK)]
         try:
             positions, stop = message_positions(block, 0, len(block))
         except BadRecord as error:
@@ -177,31 +169,20 @@ class _Walk:
             if opcode == Op.CHUNK:
                 for record in chunk_records(chunk_content(content, packed=self.packed)[0]):
                     yield self._sound(record)
-            elif opcode in PARSERS:
+            else:
                 yield self._sound(PARSERS[opcode](Fields(content)))
         except BadRecord as error:
             raise self.damaged("record", record_name(opcode), error.finding.what, at) from None
 
-    def _data_end(self, content: memoryview) -> None:
-        stated = Fields(content).uint(32) if len(content) >= 4 else 0
-        if stated and stated != self.checksum(0):
-            raise self.damaged("checksum", "the data section")
-        self.data_crc = bool(stated)
-        self.summary = self.pos + 9 + len(content)
-
-    def _footer(self, content: memoryview) -> None:
-        if self.data_crc is None:
+    def _footer(self, start: int, end: int) -> None:
+        if self.data_crc is None or end - start < 20:
             raise self.damaged("record", "the footer")
-        if len(content) < 20:
-            raise self.damaged("record", "the footer")
-        begin = self.pos
-        self.pos += 9 + 16
-        stated = _U32.unpack_from(content, 16)[0]
-        if stated and stated != self.checksum(self.summary):
+        stated = _U32.unpack_from(self.data, start + 16)[0]
+        if stated and stated != self.checksum(self.summary, start + 16):
             raise self.damaged("checksum", "the summary")
-        self.pos = begin + 9 + len(content)
+        self.pos = end
         self.need(8, "its last 8 bytes")
-        if self.data[self.pos : self.pos + 8] != MAGIC:
+        if self.data[end : end + 8] != MAGIC:
             raise self.damaged("record", "its end")
         self.pos += 8
         if self.pos != self.size:

@@ -19,8 +19,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from grounded.errors import GroundedError
-from grounded.findings import found
+from grounded.checks import refused
 from grounded.units import factor_between
 from grounded_trials.formats.mcap_records import About, Channel, End, Header, Record, Rows, Schema
 from grounded_trials.formats.messages import Floats
@@ -29,11 +28,8 @@ C = TypeVar("C")
 STAMPS = ("t", "time", "timestamp", "stamp", "times", "timestamps", "tout")
 CANDIDATE = {"candidate", "feedforward", "law"}  # names of arrays in an exported one
 TICKS = {  # an Arduino's functions, and their units in full
-    "millis": "ms",
-    "milliseconds": "ms",
-    "micros": "us",
-    "microseconds": "us",
-    "nanoseconds": "ns",
+    **dict.fromkeys(("millis", "milliseconds"), "ms"),
+    **{"micros": "us", "microseconds": "us", "nanoseconds": "ns"},
 }
 TIMES = (*STAMPS, "seconds", "secs", "clock", "clk", "elapsed", *TICKS)
 ABROAD = (  # the same in other languages, used if no column has an English name
@@ -68,7 +64,7 @@ def columns_by_name(columns: Iterable[tuple[str, C]], path: Path) -> dict[str, C
     by_name: dict[str, C] = {}
     for name, column in columns:
         if name in by_name:
-            raise GroundedError(found("given.twice", str(path), name=name))
+            raise refused("given.twice", path, name=name)
         if name:
             by_name[name] = column
     return by_name
@@ -84,8 +80,7 @@ def npz_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     with path.open("rb") as stream, np.load(stream, allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     if arrays.keys() >= CANDIDATE:
-        head = f"candidate {arrays['candidate']}"
-        raise GroundedError(found("file.no_log", str(path), head=head))
+        raise refused("file.no_log", path, head=f"candidate {arrays['candidate']}")
     texts = {key: a for key, a in arrays.items() if a.ndim == 1 and a.dtype.kind == "U"}
     labels = {key: list(map(column_name, a)) for key, a in texts.items()}
     numbers = {k: np.asarray(a, float) for k, a in arrays.items() if a.dtype.kind in "fiub"}
@@ -159,13 +154,17 @@ def table_records(
         rate: of the rows [Hz], whatever times they have; 0: a column has their times.
     """
     if not tables:
-        raise GroundedError(found("file.no_times", str(path)))
+        raise refused("file.no_times", path)
     yield Header("", kind)
     if isinstance(tables, Described):
         yield tables.about
     made = []
     for i, (topic, columns) in enumerate(tables.items()):
-        name, stamps = _at(columns, rate) if rate else _times(columns, path)
+        if rate:  # the times are those of the rows, no column's
+            rows = np.arange(len(next(iter(columns.values()))))
+            name, stamps = "rows", np.rint(rows * (1e9 / rate)).astype(np.int64)
+        else:
+            name, stamps = _times(columns, path)
         yield Schema(i + 1, f"{kind}, time in '{name}'", "", b"")
         yield Channel(i, topic, "table", i + 1, {})
         made.append(Rows(i, stamps, {k: column for k, column in columns.items() if k != name}))
@@ -173,18 +172,13 @@ def table_records(
     yield End(data_crc=False)
 
 
-def _at(columns: Columns, rate: float) -> tuple[str, Any]:
-    """Return "rows", no column's name, and the times of rows at a rate [ns]."""
-    rows = np.arange(len(next(iter(columns.values()))))
-    return "rows", np.rint(rows * (1e9 / rate)).astype(np.int64)
-
-
 def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     """Return the name of the column of times, and its values [ns]."""
     for name, values in columns.items():
         if values.dtype.kind == "i":  # [ns], from texts
             return name, values
-    name = _time_of(list(columns), path)
+    if not (name := time_among(list(columns))):
+        raise refused("file.no_times", path, names=tuple(columns)[:8])
     word = name.lower().rpartition("_")[2]
     unit = TICKS.get(word, word if word in ("ns", "us", "ms") else "")
     values = columns[name]
@@ -193,17 +187,11 @@ def _times(columns: Columns, path: Path) -> tuple[str, Any]:
     if not unit:
         unit = "ns" if top > 1e17 else "us" if top > 1e14 else "ms" if top > 1e11 else "s"
     if lost := len(values) - len(finite):
-        raise GroundedError(found("file.times", str(path), name=name, lost=lost))
+        raise refused("file.times", path, name=name, lost=lost)
     nanoseconds = round(1e9 * (factor_between(unit, "s") or 1.0))
     if top * nanoseconds > LATEST:
-        raise GroundedError(found("file.times", str(path), name=name, text=f"{top:g} {unit}"))
+        raise refused("file.times", path, name=name, text=f"{top:g} {unit}")
     return name, np.rint(values * nanoseconds).astype(np.int64)
-
-
-def _time_of(names: Sequence[str], path: Path) -> str:
-    if name := time_among(names):
-        return name
-    raise GroundedError(found("file.no_times", str(path), names=tuple(names[:8])))
 
 
 def time_among(names: Sequence[str]) -> str:

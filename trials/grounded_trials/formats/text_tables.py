@@ -13,7 +13,7 @@ import codecs
 import csv
 import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.errors import GroundedError
+from grounded.checks import refused
 from grounded.findings import found
 from grounded_trials.formats.mcap_records import About
 from grounded_trials.formats.tables import (
@@ -37,6 +37,7 @@ from grounded_trials.formats.tables import (
 
 SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
 PREAMBLE = 100  # largest number of lines above the column names
+MARKS = "\t;,"  # that separate columns, the first that is there
 LOOK = 65536  # bytes and characters that show the encoding and the separator
 DATES = ("date", "datetime", "date_time", "datum", "datum_zeit", "fecha")
 DAY = re.compile(r"^(\d{1,2})\.(\d{1,2})\.(\d{4})")  # as in Germany
@@ -50,56 +51,50 @@ class _Head:
     names: tuple[str, ...]  # "" for a column without a name
     cells: tuple[str, ...]  # as in the file, with units from a separate line
     mark: str  # separator of columns
-    line: int  # line number of the names, from 1
     rows: int  # number of lines before the first row
 
 
 def csv_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
-    """Return the numbers of a text table: a row of names, unless the layout has them, then rows."""
+    """Return the numbers of a text table: a row of names, unless the layout has them, then rows.
+
+    Its units stand in the names, `x [m]` or `x (m)`; an incomplete last row is told.
+    """
     lines = _lines(path)
     head = _head_by(layout.columns, lines, path) if layout.columns else _head(lines, path)
-    time = "" if layout.rate else _times_among(head, path)
-    cut, width = _cut(lines, head), len(head.names)
-    date = next((i for i, n in enumerate(head.names) if n.lower() in DATES and n != time), None)
+    names, width = head.names, len(head.names)
+    days = [name for name in names if name.lower() in DATES]
+    time = "" if layout.rate else time_among(names) or next(iter(days), "")
+    if not (time or layout.rate):
+        raise refused("file.no_times", path, names=tuple(filter(None, names[:8])))
+    date = next((i for i, name in enumerate(names) if name in days and name != time), None)
+    cut = _cut(lines, head)
 
     # The numbers; times are texts if the first one is.
     numbers, texts = array("d"), list[tuple[int, str, str]]()
-    for line, cells in _rows(lines[: cut[0] - 1] if cut else lines, head):
+    rows = csv.reader(lines[head.rows : cut and cut[0] - 1], delimiter=head.mark)
+    for line, row in enumerate(rows, start=head.rows + 1):
+        if not any(cells := [cell.strip() for cell in row]):
+            continue
         if any(cells[width:]) or len(cells) < width:
-            facts: dict[str, Any] = {"line": line, "has": len(cells), "names": width}
-            raise GroundedError(found("file.row", str(path), **facts))
+            raise refused("file.row", path, line=line, has=len(cells), names=width)
         numbers.extend(_number(cell, head.mark) for cell in cells[:width])
-        text = cells[head.names.index(time)] if time else ""
+        text = cells[names.index(time)] if time else ""
         if texts or (len(numbers) == width and text and np.isnan(_number(text, head.mark))):
             texts.append((line, text, "" if date is None else cells[date]))
     if not numbers:
-        raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
+        raise refused("file.rows", path, rows="no", needs=1)
     values = np.array(numbers).reshape(-1, width)
-    columns: dict[str, Any] = columns_by_name(zip(head.names, values.T, strict=True), path)
+    columns: dict[str, Any] = columns_by_name(zip(names, values.T, strict=True), path)
     columns |= {time: _stamps(texts, time, path)} if texts else {}
-    tables = Described({"/csv": columns})
-    tables.about = _about(head, lines, path)
-    return tables
 
-
-def _about(head: _Head, lines: Sequence[str], path: Path) -> About:
-    """Return the units in the column names, `x [m]` or `x (m)`, and an incomplete last row."""
-    said = {
-        name: re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell)
-        for name, cell in zip(head.names, head.cells, strict=True)
-    }
-    units = {f"/csv.{name}": m[1] for name, m in said.items() if m and '"' not in m[1]}
-    cut = _cut(lines, head)
+    # What it says of itself.
+    said = (re.search(r"[\[(]\s*([^\d\s][^\])]*?)\s*[\])]", cell) for cell in head.cells)
+    pairs = zip(names, said, strict=True)
+    units = {f"/csv.{name}": m[1] for name, m in pairs if m and '"' not in m[1]}
     odd = [found("file.cut", str(path), line=str(cut[0]), text=cut[1][:80])] if cut else []
-    return About(units, tuple(odd))
-
-
-def _rows(lines: Sequence[str], head: _Head) -> Iterator[tuple[int, list[str]]]:
-    """Yield the rows that are not blank with their line numbers, from 1."""
-    rows = csv.reader(lines[head.rows :], delimiter=head.mark)
-    for number, cells in enumerate(rows, start=head.rows + 1):
-        if any(cell.strip() for cell in cells):
-            yield number, [cell.strip() for cell in cells]
+    tables = Described({"/csv": columns})
+    tables.about = About(units, tuple(odd))
+    return tables
 
 
 def _cut(lines: Sequence[str], head: _Head) -> tuple[int, str] | None:
@@ -146,7 +141,7 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
     others: list[tuple[int, str]] = []
     for i, line in enumerate(lines[:PREAMBLE]):
         below = next((row for row in lines[i + 1 : PREAMBLE + 2] if row.strip()), "")
-        for mark in (m for m in "\t;," if m in line):
+        for mark in (m for m in MARKS if m in line):
             cells, row = _cells(line, mark), _cells(below, mark)
             if len(row) > 1 and _share(cells) == 0 and _share(row) > 0.5:
                 if len(cells) == len(row) or len(_filled(cells)) == len(_filled(row)):
@@ -154,37 +149,36 @@ def _head(lines: Sequence[str], path: Path) -> _Head:
                 others.append((i, mark))
     if others:
         return _named(lines, *others[0])
-    mark = next((m for m in "\t;," if m in lines[0]), ",")
-    cells = _cells(lines[0], mark)
+    cells = _cells(lines[0], mark := _mark(lines[0]))
     if not any(map(column_name, cells)) or _share(cells) == 1:
-        raise GroundedError(found("file.no_times", str(path), line=lines[0][:40].strip()))
+        raise refused("file.no_times", path, line=lines[0][:40].strip())
     return _named(lines, 0, mark)
 
 
 def _head_by(columns: Sequence[str], lines: Sequence[str], path: Path) -> _Head:
     """Return the head of a table whose first row of numbers has these columns."""
-    lines = lines[: PREAMBLE + 2]
-    marks = [next((m for m in "\t;," if m in line), ",") for line in lines]
-    rows = [_filled(_cells(line, mark)) for line, mark in zip(lines, marks, strict=True)]
-    i = next((i for i, cells in enumerate(rows) if cells and _share(cells) == 1), None)
-    if i is None:
-        raise GroundedError(found("file.rows", str(path), rows="no", needs=1))
-    cells, mark = rows[i], marks[i]
-    if len(cells) != len(columns):
-        raise GroundedError(found("file.row", str(path), has=len(cells), names=len(columns)))
-    return _Head(tuple(map(column_name, columns)), tuple(columns), mark, i, i)
+    for i, line in enumerate(lines[: PREAMBLE + 2]):
+        cells = _filled(_cells(line, mark := _mark(line)))
+        if cells and _share(cells) == 1:
+            if len(cells) != len(columns):
+                raise refused("file.row", path, has=len(cells), names=len(columns))
+            return _Head(tuple(map(column_name, columns)), tuple(columns), mark, i)
+    raise refused("file.rows", path, rows="no", needs=1)
+
+
+def _mark(line: str) -> str:
+    return next((mark for mark in MARKS if mark in line), ",")
 
 
 def _named(lines: Sequence[str], at: int, mark: str) -> _Head:
     """Return the head at a line; if the line above names a time, this one holds the units."""
-    cells, units, rows = _filled(_cells(lines[at], mark)), [], at + 1
+    cells = _filled(_cells(lines[at], mark))
     above = _filled(_cells(lines[at - 1], mark)) if at else []
     if len(above) == len(cells) and _any_time(above) and not _any_time(cells):
-        cells, units, at = above, cells, at - 1
-        units = [re.sub(r"^[\[(](.*)[\])]$", r"\1", unit.strip()) for unit in units]
-        pairs = zip(cells, units, strict=True)
+        units = [re.sub(r"^[\[(](.*)[\])]$", r"\1", unit.strip()) for unit in cells]
+        pairs = zip(above, units, strict=True)
         cells = [f"{c} [{u}]" if u and not re.search(r"[\[(]", c) else c for c, u in pairs]
-    return _Head(tuple(map(column_name, cells)), tuple(cells), mark, at + 1, rows)
+    return _Head(tuple(map(column_name, cells)), tuple(cells), mark, at + 1)
 
 
 def _cells(line: str, mark: str) -> list[str]:
@@ -209,25 +203,13 @@ def _share(cells: Sequence[str]) -> float:
     return len(held) / max(len(full), 1)
 
 
-def _times_among(head: _Head, path: Path) -> str:
-    """Return the name of the column of times."""
-    if named := time_among(head.names):
-        return named
-    if date := next((name for name in head.names if name.lower() in DATES), ""):
-        return date
-    names = tuple(filter(None, head.names[:8]))
-    raise GroundedError(found("file.no_times", str(path), names=names))
-
-
 def _stamps(texts: Sequence[tuple[int, str, str]], name: str, path: Path) -> Any:
     """Convert texts to times [ns]: since 1970 with a date (UTC without a zone), else of the day."""
     moments, days = list[datetime](), timedelta()
     for line, text, date in texts:
         moment = _moment(f"{date.strip()} {text.strip()}".strip()) or _moment(text)
         if moment is None:
-            raise GroundedError(
-                found("file.times", str(path), line=line, name=name, text=text.strip())
-            )
+            raise refused("file.times", path, line=line, name=name, text=text.strip())
         if moments and moment + days < moments[-1] - timedelta(hours=12) and moment.year == 1970:
             days += timedelta(days=1)  # past midnight, without a date
         moments.append(moment + days)
