@@ -13,7 +13,7 @@ reader is under the GPL.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,7 +60,7 @@ def dataflash_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     """Return the messages of a log that have numbers and a time, and the units that it states."""
     data = path.read_bytes()
     types = _types(data)
-    labels = {str(unit): text for unit, text in _texts(data, types, "UNIT", "Id", "Label")}
+    labels = {chr(unit): text for unit, text in _texts(data, types, "UNIT", "Id", "Label")}
     tables, units = Described(), dict[str, str]()
     for one in types:
         for kind, topic, rows in _instances(one, _rows(data, one)):
@@ -90,10 +90,9 @@ def _types(data: bytes) -> list[_Type]:
             if made is not None:
                 types[data[at + 3]], lengths[data[at + 3]] = made, made.length
         at = after
-    by_number = dict(types)
-    for number, units in _texts(data, list(types.values()), "FMTU", "FmtType", "UnitIds"):
-        if int(number) in by_number:
-            by_number[int(number)].units = units
+    for number, units in _texts(data, types.values(), "FMTU", "FmtType", "UnitIds"):
+        if number in types:
+            types[number].units = units
     return [kind for number, kind in types.items() if number != FMT]
 
 
@@ -119,15 +118,13 @@ def _rows(data: bytes, kind: _Type) -> Any:
     return np.frombuffer(data, np.uint8)[places].view(kind.layout)[:, 0]
 
 
-def _texts(data: bytes, types: list[_Type], name: str, key: str, value: str) -> list[Any]:
-    """Return pairs of two fields of all messages with a name, the second a text."""
-    pairs: list[Any] = []
+def _texts(data: bytes, types: Iterable[_Type], name: str, *keys: str) -> list[tuple[int, str]]:
+    """Return pairs of two fields of all messages with a name, a number and a text."""
+    pairs: list[tuple[int, str]] = []
     for kind in types:
-        if kind.name == name and {key, value} <= {*kind.columns}:
-            rows = _rows(data, kind)
-            keys = rows[key].tolist()
-            keys = keys if name == "FMTU" else [chr(one) for one in keys]
-            pairs += zip(keys, (one.decode("latin-1") for one in rows[value]), strict=True)
+        if kind.name == name and {*keys} <= {*kind.columns}:
+            numbers, texts = (_rows(data, kind)[key].tolist() for key in keys)
+            pairs += zip(numbers, (one.decode("latin-1") for one in texts), strict=True)
     return pairs
 
 
@@ -145,12 +142,12 @@ def _instances(kind: _Type, rows: Any) -> Iterator[tuple[_Type, str, Any]]:
 
 def _numbers(kind: _Type, rows: Any) -> dict[str, Floats]:
     """Return the columns of numbers of messages, and their times; {} without these."""
-    times = [name for name in kind.columns if name in TIMES]
-    if not times or not len(rows):
+    time = next((name for name in kind.columns if name in TIMES), "")
+    if not time or not len(rows):
         return {}
     columns = {
         column_name(name): rows[name] * FIELDS[letter][1]
         for name, letter in zip(kind.columns, kind.letters, strict=True)
-        if FIELDS[letter][1] and name != times[0]
+        if FIELDS[letter][1] and name != time
     }
-    return {TIMES[times[0]]: rows[times[0]].astype(float)} | columns if columns else {}
+    return {TIMES[time]: rows[time].astype(float)} | columns if columns else {}

@@ -14,8 +14,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from grounded.errors import GroundedError
-from grounded.findings import found
+from grounded.checks import refused
 from grounded_trials.plain_file import read_file
 
 EPISODE = re.compile(r"episode_(\d+)")
@@ -49,18 +48,17 @@ def episode_files(path: Path) -> list[Path]:
 def info_of(folder: Path) -> dict[str, Any]:
     """Return meta/info.json with all that is read of it."""
     path = folder / "meta" / "info.json"
+    needed = {"features": dict, "total_episodes": int, "fps": (int, float), "data_path": str}
     try:
-        info = json.loads(read_file(path, INFO_LIMIT))
-        info = {"codebase_version": "", "chunks_size": 1000, **info}
-        needed = {"features": dict, "total_episodes": int, "fps": (int, float), "data_path": str}
+        read = json.loads(read_file(path, INFO_LIMIT))
+        info = {"codebase_version": "", "chunks_size": 1000, **read}
         bad = [key for key, kind in needed.items() if not isinstance(info.get(key), kind)]  # type: ignore[arg-type]
         if not bad:
-            kept = {key: one for key, one in info["features"].items() if isinstance(one, dict)}
             bad += ["fps"] * (not info["fps"] > 0)
             bad += ["total_episodes"] * (not 0 < info["total_episodes"] <= EPISODE_LIMIT)
-        if not bad:
-            return info | {"features": kept}
         why = ", ".join(bad)
     except (ValueError, TypeError, RecursionError) as error:
-        why = str(error)
-    raise GroundedError(found("file.unreadable", str(path), why=why, kind="LeRobot data set"))
+        why = str(error) or type(error).__name__
+    if why:
+        raise refused("file.unreadable", path, why=why, kind="LeRobot data set")
+    return info | {"features": {k: v for k, v in info["features"].items() if isinstance(v, dict)}}

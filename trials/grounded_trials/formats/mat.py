@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,11 @@ CALLED = ("Name", "name", "label", "blockName")  # what names it
 NUMBERS, TEXT, REFERENCES = "fiub", "char", "O"
 
 
+@dataclass(frozen=True)
 class _Object:
     """A variable of one of MATLAB's own classes, which can't be read."""
 
-    def __init__(self, kind: str) -> None:
-        self.kind = kind
+    kind: str
 
 
 def mat_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
@@ -74,8 +75,7 @@ def _tables_in(content: Mapping[str, Any], path: Path, layout: Layout) -> Tables
         tables[topic] = {**tables.get(topic, {"time": clock}), **columns}
     objects = {name: one.kind for name, one in content.items() if isinstance(one, _Object)}
     if not tables and objects:
-        kinds = tuple(dict.fromkeys(objects.values()))
-        why = f"{', '.join(objects)}: {', '.join(kinds)}"
+        why = f"{', '.join(objects)}: {', '.join(dict.fromkeys(objects.values()))}"
         raise unreadable(path, why, kind="MATLAB class")
     return tables
 
@@ -110,8 +110,9 @@ def _node(node: Any) -> Any:
     if "MATLAB_object_decode" in node.attrs and kind != TEXT:
         return _Object(kind)
     if isinstance(node, h5py.Group):
-        fields = _struct(node)
-        if fields and all(_is_of_array(node[name]) for name in fields):
+        fields, bare = _struct(node), "MATLAB_class"  # that fields of an array of structs lack
+        array = (isinstance(node[n], h5py.Dataset) and bare not in node[n].attrs for n in fields)
+        if fields and all(array) and all(isinstance(one, list) for one in fields.values()):
             items = zip(*fields.values(), strict=False)
             return [dict(zip(fields, item, strict=True)) for item in items]
         return fields
@@ -123,12 +124,6 @@ def _node(node: Any) -> Any:
     if kind == TEXT:
         return "".join(map(chr, np.ravel(values)))
     return np.squeeze(np.transpose(values))  # its first dimension is MATLAB's last
-
-
-def _is_of_array(field: Any) -> bool:
-    """Check whether a field is one of an array of structs: references without a class."""
-    kind = getattr(getattr(field, "dtype", None), "kind", "")
-    return kind == REFERENCES and "MATLAB_class" not in field.attrs
 
 
 def _tables(
@@ -186,12 +181,9 @@ def _numbers(one: Any) -> Floats | None:
 
 def _columns(name: str, a: Floats | None, rows: int) -> Iterator[tuple[str, Floats]]:
     """Yield the columns of an array (N, k), (N,) or (k, N), by name."""
-    if a is None or rows not in a.shape:
-        return
     bare = column_name(name)
-    if a.ndim == 1:
+    if a is not None and a.shape == (rows,):
         yield bare, a
-        return
-    wide = a if a.shape[0] == rows else a.T
-    for i, column in enumerate(wide.T):
-        yield f"{bare}[{i}]", column
+    elif a is not None and rows in a.shape:
+        for i, column in enumerate((a if len(a) == rows else a.T).T):
+            yield f"{bare}[{i}]", column

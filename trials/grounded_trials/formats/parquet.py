@@ -52,19 +52,14 @@ def episode_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
     if table is None or not len(table) or "frame_index" not in table.column_names:
         high = info["total_episodes"] - 1
         raise wrong("episode", got=path.name, must="whole", low=0, high=high)
-    times = table["frame_index"].to_numpy() / float(info["fps"])
-    signals = [
-        key
-        for key, one in info["features"].items()
-        if key not in COUNTED and not key.startswith("next.") and _is_signal(one)
-    ]
+    times = {"timestamp_s": table["frame_index"].to_numpy() / float(info["fps"])}
     tables: Tables = {}
-    for key in sorted(signals, key=lambda key: (key not in FIRST, key in LAST)):
-        if key in table.column_names:
+    for key in sorted(info["features"], key=lambda key: (key not in FIRST, key in LAST)):
+        feature, counted = info["features"][key], key in COUNTED or key.startswith("next.")
+        if key in table.column_names and not counted and _is_signal(feature):
             columns = [values for _, values in _numbers(key, table[key])]
-            named = zip(_names(info["features"][key], len(columns)), columns, strict=True)
-            times_of = {"timestamp_s": times}
-            tables["/" + key.replace(".", "/")] = times_of | columns_by_name(named, path)
+            named = zip(_names(feature, len(columns)), columns, strict=True)
+            tables["/" + key.replace(".", "/")] = times | columns_by_name(named, path)
     return tables
 
 
