@@ -249,7 +249,7 @@ def panel(
     equal: bool = False,
     loss: bool = False,
     log: bool = False,
-    whole: bool = False,
+    x_range: tuple[float, float] | None = None,
     x_ticks: Sequence[tuple[float, str]] = (),
     y_range: tuple[float, float] | None = None,
     note: str = "",
@@ -266,12 +266,13 @@ def panel(
         equal: equal scales on both axes.
         loss: the y axis shows losses y < 0 by the logarithm of -y, the smallest at the top.
         log: both axes are logarithmic; what has no logarithm is left out.
-        whole: x values are whole numbers.
+        x_range: ends of the x axis, if not those of the contents.
         x_ticks: positions and labels of ticks; () for automatic.
-        y_range: ends of the y axis, if not those of the contents.
+        y_range: ends of the y axis.
         note: see `Panel`.
         kind: see `Panel`.
     """
+    upright = log or loss
     if loss:
         traces, shapes = _costs(traces, shapes)
 
@@ -283,23 +284,17 @@ def panel(
     xs = [one["x"] for one in seen]
     rules = [one["y0"] for one in shapes if one["type"] == "line"]
     ys = [*(one["y"] for one in seen), np.array(rules, float)]
+
     if log:
         traces = [_positive(one) for one in traces]
 
     # the axes
     margin = 0.06 if equal else 0.03 if dots or kind != "time" else 0.0
-    left, right = fitted(map(_log10, xs) if log else xs, margin)
-    if whole:
-        left, right = left - 0.6, right + 0.6
-    low, high = y_range or fitted(map(_log10, ys) if log or loss else ys)
-    across, up = _axis(x_name, left, right), _axis(y_name, low, high)
-    if whole:
-        across |= {"tickformat": "d", "dtick": max(1, round((right - left) / 8))}
-    for axis in (across, up) if log else (up,) if loss else ():
-        ticks = log_ticks(*axis["range"])
-        axis |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
+    across = _axis(x_name, x_range or fitted(xs, margin, log=log), log=log)
+    up = _axis(y_name, y_range or fitted(ys, log=upright), log=upright)
     if loss:
-        up |= {"range": [high, low], "ticktext": [f"−{text}" for text in up["ticktext"]]}
+        ticks = [f"−{text}" for text in up["ticktext"]]
+        up |= {"range": up["range"][::-1], "ticktext": ticks}
     if x_ticks:
         at, labels = zip(*x_ticks, strict=True)
         labels = tuple(label.replace("\n", "<br>") for label in labels)
@@ -308,7 +303,7 @@ def panel(
         up["scaleanchor"] = "x"
 
     # marks without a value are on the lower edge
-    edge = 10.0 ** up["range"][0] if log or loss else up["range"][0]
+    edge = 10.0 ** up["range"][0] if upright else up["range"][0]
     for one in dots:
         one["y"][~np.isfinite(one["y"])] = edge
     return Panel(title, traces, {"xaxis": across, "yaxis": up, "shapes": [*shapes]}, note, kind)
@@ -332,11 +327,15 @@ def _positive(trace: Trace) -> Trace:
     return trace | {"x": trace["x"][known], "y": trace["y"][known], "mode": mode}
 
 
-def _axis(name: str, low: float, high: float) -> dict[str, Any]:
-    return {
-        "title": {"text": name, "standoff": 6}, "range": [low, high], "gridcolor": "@grid",
+def _axis(name: str, ends: tuple[float, float], *, log: bool) -> dict[str, Any]:
+    axis: dict[str, Any] = {
+        "title": {"text": name, "standoff": 6}, "range": [*ends], "gridcolor": "@grid",
         "zeroline": False, "linecolor": "@grid", "automargin": True,
     }  # fmt: skip
+    if log:
+        ticks = log_ticks(*ends)
+        axis |= {"type": "log", "tickvals": ticks, "ticktext": [f"{v:g}" for v in ticks]}
+    return axis
 
 
 def key_trace(key: Key) -> Trace:
@@ -354,13 +353,12 @@ def key_trace(key: Key) -> Trace:
 # ranges, ticks, points
 
 
-def _log10(values: Array) -> Array:
-    """Return log10; NaN for values without a logarithm."""
-    return np.log10(np.where(values > 0, values, np.nan))
-
-
-def fitted(values: Iterable[Array], margin: float = 0.06) -> tuple[float, float]:
-    """Return a range around the finite values, with a margin."""
+def fitted(
+    values: Iterable[Array], margin: float = 0.06, *, log: bool = False
+) -> tuple[float, float]:
+    """Return a range around the finite values, or around their logarithms, with a margin."""
+    if log:
+        values = (np.log10(v[v > 0]) for v in values)
     kept = [v[np.isfinite(v)] for v in values]
     kept = [v for v in kept if len(v)]
     if not kept:

@@ -75,7 +75,7 @@ def _utility(now: Standing, tried: list[Tried], number: dict[str, int]) -> Panel
         shapes,
         x_ticks=_named(now.history, number),
         loss=loss,
-        whole=True,
+        x_range=(0.4, len(now.history) + 0.6),
     )
 
 

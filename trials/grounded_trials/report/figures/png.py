@@ -114,10 +114,6 @@ def _axis(axes: Any, name: str, axis: dict[str, Any], grows: bool) -> None:
         set_ticks(axis["tickvals"], [text.replace("<br>", "\n") for text in axis["ticktext"]])
     if ends:
         getattr(axes, f"set_{name}lim")(ends, auto=grows)
-    if "dtick" in axis and "tickvals" not in axis:
-        from matplotlib.ticker import MaxNLocator
-
-        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if "title" in axis:
         getattr(axes, f"set_{name}label")(typeset(axis["title"]["text"]))
 
