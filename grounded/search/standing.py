@@ -21,19 +21,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any
+from html import escape
+from typing import Any
 
 from grounded.errors import NextCommand
+from grounded.figures import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.difference import LUCK, Difference, judged, last_gain
+from grounded.search.pictures import search_figure
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
-
-if TYPE_CHECKING:
-    from grounded.figures import Figure
 
 
 class Phase(StrEnum):
@@ -203,16 +203,12 @@ class Standing(Result):
 
     def _repr_html_(self) -> str:
         """Return the candidates as a table and the phase as a sentence, for Jupyter."""
-        from html import escape
-
         phase = f"<p>{escape(self.outcome)}: {escape(self.sentence)}</p>"
         whole = f"<details><summary>The whole document</summary>{super()._repr_html_()}</details>"
         return f"<b>Search</b>{html_table(*self.table())}{phase}{whole}"
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of utilities by candidate and step sizes."""
-        from grounded.search.pictures import search_figure
-
         found = search_figure(self)
         return () if found is None else (found,)
 
