@@ -21,7 +21,6 @@ from grounded_cli.console.terminal import (
 from grounded_trials.logs.log_paths import logs_in
 from grounded_trials.workspace.intake.ingest import Ingested
 
-FINDINGS_TOLD = 3  # findings that are told without --details
 ASIDE = "set aside"  # a verdict
 
 
@@ -53,7 +52,7 @@ def tell_ingested(name: str, one: Ingested, details: bool, earlier: Sequence[Fin
         show(f"{name}: {one.trial}, stored before")
     told = {(note.code, note.about) for note in earlier if note.weight is Weight.NOTE}
     new = [note for note in one.findings if details or (note.code, note.about) not in told]
-    tell(new, name, most=len(new) if details else FINDINGS_TOLD)
+    tell(new, name, all_=details)
     if not one.known:
         show(f"{name}: {one.trial}")
     if not one.candidate:

@@ -15,7 +15,7 @@ CALIBRATION = "calibration"  # the cause that is the calibrated parameters, in `
 # families of what arrives late, and the quantity that is a time [s]
 TIMES = {"delay": "d", "sensor_delay": "d", "first_order_lag": "tau", "sensor_lag": "tau"}
 TINY = 1e-12  # an error that stands in for none
-STATES = 2  # whose errors are told
+TOLD = 2  # most of a kind in words: states, causes, parameters; tables have all
 BRIEF: dict[str, Any] = {"brief": True}  # marks a field whose key is omitted if it is empty
 
 
@@ -317,7 +317,7 @@ def states_told(row: RulerRow, tracked: Sequence[str] = ()) -> list[str]:
     """
     gains = {name: gain for name, gain in row.gains.items() if gain > SHOWS}
     order = {name: k for k, name in enumerate(tracked)}
-    best = sorted(gains, key=lambda n: (order.get(n, len(tracked)), -gains[n]))[:STATES]
+    best = sorted(gains, key=lambda n: (order.get(n, len(tracked)), -gains[n]))[:TOLD]
     return best or [name for name in [row.most_off] if name]
 
 

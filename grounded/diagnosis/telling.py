@@ -16,6 +16,7 @@ import numpy as np
 from grounded.accounts.finding import Finding as Fault
 from grounded.diagnosis.error_report import (
     CALIBRATION,
+    TOLD,
     RulerRow,
     errors,
     excess,
@@ -36,7 +37,6 @@ NEXT = "gap.next."  # before the codes of next steps
 LINES = frozenset(  # codes of the lines, which are made from the facts
     f"gap.{name}" for name in ("causes", "none", "unknown", "too_few", "errors", "left", "where")
 )
-CAUSES = 2  # told in words; the table has all
 FINDINGS = 3  # told beside the lines; the others with --details
 
 
@@ -104,8 +104,8 @@ def _what(d: Diagnosis) -> Finding:
         return found("gap.too_few")
     if causes:
         tied = any(name in group for group in d.indistinguishable for name in d.effects)
-        more = len(causes) - CAUSES
-        words = "; ".join(causes[:CAUSES])
+        more = len(causes) - TOLD
+        words = "; ".join(causes[:TOLD])
         return found(
             "gap.causes", *d.effects, causes=words, more=max(more, 0), tied=tied, left=left
         )

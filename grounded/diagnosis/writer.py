@@ -20,6 +20,7 @@ from grounded.diagnosis.causes import (
 )
 from grounded.diagnosis.error_report import (
     CALIBRATION,
+    TOLD,
     ChannelShare,
     Gap,
     RulerRow,
@@ -65,8 +66,6 @@ from grounded.task import Task
 from grounded.trial import Trial
 
 MOST_EFFECTS = 12  # most effects blamed at once
-NAMED = 2  # most parameters in the words of a cause
-MENTIONED = 2  # most effects that one group of trials shows
 
 
 def written(
@@ -214,10 +213,10 @@ def _causes(
         f"{c} = {d.parameters[n].text}, was {number(d.made.nominal[n])}"
         for c, n in zip(called, off, strict=True)
     ]
-    shown = each if len(off) <= NAMED else called[:NAMED]
+    shown = each if len(off) <= TOLD else called[:TOLD]
     rest = len({*off, *d.adoptable}) - len(shown)
     words = (*shown, *[f"{rest} more"] * (rest > 0))
-    values = words if len(off) <= NAMED else None
+    values = words if len(off) <= TOLD else None
     own = found("model.off", values=values, names=words).sentence
     by_name = {effect.name: effect for effect in effects}
     return tuple(
@@ -287,7 +286,7 @@ def unconfirmed(
         for one in doubtful
         if one.name not in tied and not claims.known.no_cause
     ]
-    return tuple(found[:MENTIONED])
+    return tuple(found[:TOLD])
 
 
 def quantity(e: Estimate) -> Quantity:

@@ -32,6 +32,7 @@ from grounded.frozen import Array
 from grounded.trial import Trial
 from grounded_trials.plain_file import unwritable
 from grounded_trials.report.bodies import body_in, finite, is_mechanism, reach, scene_of
+from grounded_trials.report.figures.paths import OTHERS
 from grounded_trials.report.figures.runs import all_figures, averaged, window_of
 from grounded_trials.report.findings import Findings, Run
 from grounded_trials.report.tables import about, counted, improved
@@ -42,7 +43,6 @@ COLOURS |= {"desired": (170, 170, 170), "other": (110, 110, 110)}
 SERIES = [COLOURS[role] for role in ("best", "limit", "accepted", "step2", "predicted", "model")]
 FRAMES = 600  # largest number of poses of a body in an animation
 DISTANCE = 1.4  # of the camera, times the size of the contents
-TRIALS = 60  # largest number of trials with a tab of their own
 SIGNALS = {"state": "states", "input": "inputs", "bias": "bias"}  # of a trial
 FIRST = {"states": 4, "inputs": 2, "bias": 2}  # plots in the overview; all have a tab
 
@@ -315,10 +315,10 @@ def _trials(findings: Findings, view: Mapping[str, Any]) -> list[Any]:
     """Return a tab for each of the latest trials and logs."""
     shown = [
         (f"/trials/{run.trial.id}", f"{run.label}, utility {figure(run.utility)}", run.explained)
-        for run in findings.runs[-TRIALS:]
+        for run in findings.runs[-OTHERS:]
     ]
     shown += [
-        (f"/data/{log.trial.id}", f"{log.trial.id}, data", None) for log in findings.logs[-TRIALS:]
+        (f"/data/{log.trial.id}", f"{log.trial.id}, data", None) for log in findings.logs[-OTHERS:]
     ]
     tabs = []
     for at, title, explained in shown:

@@ -24,7 +24,7 @@ from grounded_trials.report.bodies import Scene, body_in, is_mechanism, scene_of
 from grounded_trials.report.findings import Findings, Log, Run, compared
 from grounded_trials.wording import labelled
 
-OTHERS = 60  # largest number of runs drawn behind the compared ones
+OTHERS = 60  # largest number of runs behind the compared ones, and of tabs of a recording
 LOG_ROLES = ("best", "model", "accepted", "limit")  # of the latest logs, if there is no run
 
 
