@@ -206,15 +206,13 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
     if meta is None or meta.get("format") != kind:
         has = str(meta and meta.get("format"))
         raise unreadable(name, f"format {has}", kind=f"{kind} file")
-    types = {topic.name: _type(topic, name) for topic in topics}
+    types = dict[str, Schema]()
+    for topic in topics:
+        schema, encoding = topic.schema, topic.channel.encoding
+        if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
+            raise unreadable(f"{name}: {topic.name}", encoding)
+        types[topic.name] = schema
     return OwnFile(name, source, meta, attachments, types, messages)
-
-
-def _type(topic: Topic, name: str) -> Schema:
-    schema, encoding = topic.schema, topic.channel.encoding
-    if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
-        raise unreadable(f"{name}: {topic.name}", encoding)
-    return schema
 
 
 def stated(

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from grounded.checks import refused
 from grounded.diagnosis.error_report import errors
 from grounded.effects import param_name
-from grounded.errors import GroundedError, NextCommand
+from grounded.errors import NextCommand
 from grounded.findings import Finding, settle
 from grounded.findings import found as finding
 from grounded.fit import fit
@@ -122,14 +123,20 @@ def fit_in(
     if share.finding is not None:
         found = replace(found, findings=(*found.findings, share.finding))
     seen = where_to_mend(workspace, used, found.preflight)
-    kept = () if names or latency else _taken_as_exact(workspace, found)
+    delays = (name for name in workspace.config.model.effects if name.startswith("delay:"))
+    exact = tuple(name for name in delays if param_name(name, "d") not in found.params)
+    kept = () if names or latency else exact
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids)
     fitted = partial(fitted, rows_s=rows * bool(late), interpolated_s=early)
     if apply and found.worse:
-        raise GroundedError(_worse(found), then=after_fit(workspace))
+        row = found.prediction_error[-1]
+        name = max(row.changes, key=lambda name: row.changes[name])  # the most affected state
+        ends = errors(row, name, now="with_effects", before="crude")
+        facts = {"state": name, "ahead": row.horizon_s, **ends}
+        raise refused("model.fit_worse", then=after_fit(workspace), **facts)
     if not apply:
         # parameters alone stand for what the last diagnosis has found beside them
         last = readable_diagnosis(workspace.reports)
@@ -174,20 +181,6 @@ def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:
         if np.allclose(plan.latency[list(inputs)], values["d"], rtol=0.0, atol=1e-9):
             found[param_name(effect, "d")] = inputs
     return found
-
-
-def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
-    """Return the adopted delays that were not fitted."""
-    delays = (name for name in workspace.config.model.effects if name.startswith("delay:"))
-    return tuple(name for name in delays if param_name(name, "d") not in found.params)
-
-
-def _worse(found: Fit) -> Finding:
-    """Return how much worse a fit predicts, with the most affected state."""
-    row = found.prediction_error[-1]
-    name = max(row.changes, key=lambda name: row.changes[name])
-    ends = errors(row, name, now="with_effects", before="crude")
-    return finding("model.fit_worse", state=name, ahead=row.horizon_s, **ends)
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:

@@ -86,8 +86,8 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
             continue
         running, terminal = task.reward.state[states], task.reward.terminal[states]
         cost = sum(float((e**2 @ running).sum() + e[-1] ** 2 @ terminal) for e in each)
-        noise = reading_noise(whole, states)
-        values = {"noise": float(np.linalg.norm(noise))}
+        noise = [trial.noise(trial.finite_steps + 1)[states] for trial in whole]
+        values = {"noise": math.sqrt(np.mean(np.square(noise), axis=0).sum())}  # of a sample
         size = np.abs(task.target[:, states]).max()  # that the errors are differences of
         if running.any() or ended:
             far = [np.linalg.norm(e, axis=1) for e in each]
@@ -99,21 +99,11 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
         values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
         unit = task.model.states[names[0]]
         found[k] = cost, OffTarget(what.removeprefix("the "), unit, **values)
-    told = sorted(found, key=lambda k: (_is_rate(task, k), -found[k][0]))[:GROUPS_TOLD]
+    units = [task.model.states[names[0]] for names, _ in weighed_groups(task)]
+    rates = {k for k, unit in enumerate(units) if any(unit == f"{other}/s" for other in units)}
+    told = sorted(found, key=lambda k: (k in rates, -found[k][0]))[:GROUPS_TOLD]
     dear = max(found, key=lambda k: found[k][0], default=-1)
     return tuple(one for k, (_, one) in found.items() if k in {*told, dear})
-
-
-def reading_noise(trials: Sequence[Trial], states: Sequence[int]) -> Array:
-    """Return the noise (std) of one sample of each of some states, (k,), rms over runs."""
-    each = [trial.noise(trial.finite_steps + 1) for trial in trials]
-    return np.asarray(np.sqrt(np.mean(np.square(each), axis=0))[list(states)])
-
-
-def _is_rate(task: Task, group: int) -> bool:
-    """Return whether a group of `weighed_groups` is the rate of another one."""
-    units = [task.model.states[names[0]] for names, _ in weighed_groups(task)]
-    return any(units[group] == f"{other}/s" for other in units)
 
 
 def reaches(task: Task) -> bool:

@@ -264,7 +264,12 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *left_out(workspace),
         *here.since.findings,
     ]
-    best = standing.incumbent
+    best, model = standing.incumbent, workspace.config.model
+    adopted: tuple[tuple[str, str], ...] = ()
+    if model.effects or model.params:
+        from grounded_trials.workspace.adoption import adopted_rows  # slow
+
+        adopted = adopted_rows(workspace)
     return Status(
         standing,
         then,
@@ -274,18 +279,9 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         off_target_of(workspace.task, best.trials if best else ()),
         last,
         here.since if last else None,
-        _adopted(workspace),
+        adopted,
         much_noise(best.noise_cost, best.utility) if best else None,
     )
-
-
-def _adopted(workspace: Folder) -> tuple[tuple[str, str], ...]:
-    """Return what was adopted, without slow imports if nothing was."""
-    if not (workspace.config.model.effects or workspace.config.model.params):
-        return ()
-    from grounded_trials.workspace.adoption import adopted_rows
-
-    return adopted_rows(workspace)
 
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:

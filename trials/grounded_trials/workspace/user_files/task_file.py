@@ -118,7 +118,9 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
             names = [name.strip() for name in next(reader, [])]
             if not names:
                 raise refused("file.rows", path.name, rows="no", needs=2, target=1, then=SHAPE)
-            _check_header(path, names)
+            one_of(f"the first column of {path.name}", names[0], ["t"])
+            if twice := [name for name in names if names.count(name) > 1]:
+                raise refused("given.twice", path.name, name=twice[0])
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
                 if len(rows) > ROW_LIMIT:
@@ -132,13 +134,6 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
     except (OSError, UnicodeDecodeError, csv.Error) as error:
         raise unreadable(path, error, kind="CSV") from None
     return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
-
-
-def _check_header(path: Path, names: list[str]) -> None:
-    one_of(f"the first column of {path.name}", names[0], ["t"])
-    twice = [name for name in names if names.count(name) > 1]
-    if twice:
-        raise refused("given.twice", path.name, name=twice[0])
 
 
 def _numbers(
