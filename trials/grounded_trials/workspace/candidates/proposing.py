@@ -155,24 +155,16 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
         from grounded_trials.workspace.candidates.first_plan import left_open  # not for `status`
 
         notes += left_open(workspace, candidate)
-    status = status_of(workspace, now)
-    if now.doubt and Situation(workspace, now, status.diagnosis).doubted:
+    if now.doubt and Situation(workspace, now).doubted:
         notes.append(now.doubt)
-    if candidate is None:
-        return _ended(workspace, proposal, status, notes)
-    return _told(workspace, proposal, notes)
+    if candidate is not None:
+        return _told(workspace, proposal, notes)
 
-
-def _ended(
-    workspace: Folder,
-    proposal: Proposal,
-    status: Status,
-    notes: Sequence[Finding],
-) -> Proposed:
-    """Return that there is nothing to run."""
-    best, converged = proposal.standing.incumbent, status.standing.phase is Phase.CONVERGED
+    # There is nothing to run.
+    status, best = status_of(workspace, now), now.incumbent
+    converged = status.standing.phase is Phase.CONVERGED
     if best and converged and best.candidate.model != workspace.planner.fingerprint:
-        notes = [*notes, found("plan.no_better", best.candidate.id)]
+        notes.append(found("plan.no_better", best.candidate.id))
     over = replace(proposal, standing=status.standing)
     return Proposed(over, None, status.then, settle((*proposal.findings, *notes)))
 
