@@ -106,7 +106,7 @@ def fit_in(
     planner, share, names = workspace.planner, chosen(workspace, trials), params
     used, ids = share.trials, tuple(trial.id for trial in share.trials)
     adopted, every = _adopted_delays(workspace), tuple(range(planner.plan.model.m))
-    rows, early = unsure_times(workspace.whole_trials(), ids)
+    rows, early = unsure_times(workspace, ids)
     found = fit(
         planner.plan,
         [planner.lift(trial) for trial in used],
