@@ -128,12 +128,12 @@ class Since:
         return not self.newer and (adopted or not self.changed)
 
     @property
-    def findings(self) -> tuple[Finding, ...]:
-        """Why the diagnosis is outdated; () if it is not."""
+    def finding(self) -> Finding | None:
+        """Why the diagnosis is outdated; None if it is not."""
         only = self.changed and not self.adopted
         if not (self.newer or self.adopted or only):
-            return ()
-        one = found(
+            return None
+        return found(
             "search.outdated",
             used=self.used if self.newer else None,
             usable=self.usable,
@@ -141,12 +141,11 @@ class Since:
             missing=self.missing,
             changed=int(only),
         )
-        return (one,)
 
     @property
     def sentence(self) -> str:
         """Why the diagnosis is outdated, in words; "" if it is not."""
-        return "; ".join(one.sentence for one in self.findings)
+        return self.finding.sentence if self.finding else ""
 
 
 def model_print(workspace: Folder) -> str:
@@ -165,20 +164,17 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others
-    now = listed(model.effects)
-    missing = diagnosis.open(now, model.params)
+    missing = diagnosis.open(listed(model.effects), model.params)
     adopted = [name for name in diagnosis.effects if name not in missing]
     known = {*made.effects, *diagnosis.effects}
     adopted += [name for name in model.effects if name not in known]
-    same = now == [*map(dict, made.adopted)]
-    same = same and made.params in (None, dict(model.params))
     return Since(
         used=sum(name in made.trials for name in usable),
         usable=len(usable),
         newer=len(usable) - 1 - last if made.trials else 0,
         adopted=tuple(adopted),
         missing=missing if adopted else (),
-        changed=not same or made.model not in ("", model_print(workspace)),
+        changed=made.model not in ("", model_print(workspace)),
         further=diagnosis.verdict.again,
     )
 

@@ -251,10 +251,9 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
         *notes,
         *([asked[1]] if asked else []),
         *gone,
-        *filter(None, [overtaken(workspace)]),
         *uncounted(workspace, standing),
         *left_out(workspace),
-        *here.since.findings,
+        *filter(None, [overtaken(workspace), here.since.finding]),
     ]
     best, model = standing.incumbent, workspace.config.model
     adopted: tuple[tuple[str, str], ...] = ()
