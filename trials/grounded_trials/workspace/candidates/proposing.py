@@ -249,11 +249,12 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     asked = asked_about(workspace)
     every = [
         *notes,
-        *([asked[1]] if asked else []),
+        asked[1] if asked else None,
         *gone,
+        overtaken(workspace),
         *uncounted(workspace, standing),
         *left_out(workspace),
-        *filter(None, [overtaken(workspace), here.since.finding]),
+        here.since.finding,
     ]
     best, model = standing.incumbent, workspace.config.model
     adopted: tuple[tuple[str, str], ...] = ()
@@ -264,7 +265,7 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     return Status(
         standing,
         then,
-        settle(every),
+        settle(one for one in every if one),
         _certainty(standing),
         workspace.discarded(),
         off_target_of(workspace.task, best.trials if best else ()),
