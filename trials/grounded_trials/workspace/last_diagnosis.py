@@ -164,17 +164,19 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others
-    missing = diagnosis.open(listed(model.effects), model.params)
+    now = listed(model.effects)
+    missing = diagnosis.open(now, model.params)
     adopted = [name for name in diagnosis.effects if name not in missing]
     known = {*made.effects, *diagnosis.effects}
     adopted += [name for name in model.effects if name not in known]
+    same = now == [*map(dict, made.adopted)] and made.params in (None, dict(model.params))
     return Since(
         used=sum(name in made.trials for name in usable),
         usable=len(usable),
         newer=len(usable) - 1 - last if made.trials else 0,
         adopted=tuple(adopted),
         missing=missing if adopted else (),
-        changed=made.model not in ("", model_print(workspace)),
+        changed=not same or made.model not in ("", model_print(workspace)),
         further=diagnosis.verdict.again,
     )
 
