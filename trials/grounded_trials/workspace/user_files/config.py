@@ -177,7 +177,7 @@ def as_toml(value: Any) -> Any:
     return value
 
 
-def set_keys(file: Path, table: str, **values: Any) -> None:
+def set_keys(file: Path, table: str, /, **values: Any) -> None:
     """Replace keys in a table of grounded.toml; the rest of the file is unchanged.
 
     A value of None leaves the old one, an empty one removes the key.
