@@ -158,9 +158,10 @@ def model_print(workspace: Folder) -> str:
 
 def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     """Return what changed in a workspace since a diagnosis was made; nothing without one."""
+    usable = usable_ids(workspace)
     if diagnosis is None:
-        return Since()
-    model, made, usable = workspace.config.model, diagnosis.made, usable_ids(workspace)
+        return Since(usable=len(usable))
+    model, made = workspace.config.model, diagnosis.made
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others

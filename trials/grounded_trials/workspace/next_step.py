@@ -82,11 +82,6 @@ class Situation:
         """What changed since the diagnosis."""
         return since_diagnosis(self.workspace, self.diagnosis)
 
-    @cached_property
-    def usable(self) -> int:
-        """How many trials a diagnosis can use now."""
-        return self.since.usable if self.diagnosis else len(usable_ids(self.workspace))
-
     @property
     def then(self) -> NextCommand:
         """The command to type next, by `NEXT`."""
@@ -119,7 +114,7 @@ class Situation:
 
         A single run would confirm nothing.
         """
-        new = self.usable if self.diagnosis is None else self.since.newer
+        new = self.since.usable if self.diagnosis is None else self.since.newer
         return bool(self.now.doubt) and new >= LOST
 
     @property
@@ -167,7 +162,9 @@ NEXT: tuple[Row, ...] = (
     (
         ANY,
         lambda s: (
-            not s.diagnosis and s.usable and (not s.now.history or s.now.phase is not Phase.PROPOSE)
+            not s.diagnosis
+            and s.since.usable
+            and (not s.now.history or s.now.phase is not Phase.PROPOSE)
         ),
         lambda s: to_learn_from(s.workspace),
     ),
