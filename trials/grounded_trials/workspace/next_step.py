@@ -16,12 +16,7 @@ from grounded.search.standing import LOST, Ending, Phase, Standing
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import (
-    Since,
-    readable_diagnosis,
-    since_diagnosis,
-    usable_ids,
-)
+from grounded_trials.workspace.last_diagnosis import Since, readable_diagnosis, since_diagnosis
 from grounded_trials.workspace.new_target import PROPOSE, TARGET, to_plan, undrawn
 
 if TYPE_CHECKING:
@@ -162,9 +157,7 @@ NEXT: tuple[Row, ...] = (
     (
         ANY,
         lambda s: (
-            not s.diagnosis
-            and s.since.usable
-            and (not s.now.history or s.now.phase is not Phase.PROPOSE)
+            not (s.diagnosis or (s.now.history and s.now.phase is Phase.PROPOSE)) and s.since.usable
         ),
         lambda s: to_learn_from(s.workspace),
     ),
