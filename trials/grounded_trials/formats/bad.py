@@ -10,10 +10,7 @@ from grounded.findings import found
 class Bad(Exception):
     """A part of a file can't be read.
 
-    Args:
-        code: its entry in the catalogue; that of the area `file` without it.
-        *about: what it is about.
-        **facts: of the finding.
+    `code` is its entry in the catalogue, in the area `file` unless it says another.
     """
 
     def __init__(self, code: str, *about: str, **facts: Any) -> None:

@@ -35,11 +35,8 @@ def columns(
 ) -> Any:
     """Return messages as one: each number a column (N,), a list of k numbers an array (k, N).
 
-    Args:
-        rows: the bytes of N messages (N, length).
-        name: of their type.
-        types: the fields of each type, as rosbags parses them.
-        classes: those of rosbags, by type.
+    `rows` are the bytes of N messages (N, length) of a type; `types` and `classes` are the fields
+    and the classes of each, as rosbags has them. Raises `Uneven`.
     """
     block = _Block(rows, types, classes)
     message = block.of_type(name)

@@ -266,10 +266,7 @@ def chunk_content(content: bytes | memoryview, *, packed: bool = True) -> tuple[
 def decompress(compression: str, data: bytes, size: int) -> tuple[bytes, str]:
     """Return a chunk's content up to an error or to size + 1 bytes, and the error, "" for none.
 
-    Args:
-        compression: "", "lz4" or "zstd".
-        data: the compressed bytes.
-        size: the decompressed size that the chunk states [bytes].
+    The compression is "", "lz4" or "zstd"; `size` is what the chunk states.
     """
     if not compression:
         return data, ""

@@ -52,13 +52,8 @@ _U32 = Struct("<I")
 class DamagedFile(GroundedError):
     """A file that violates the MCAP format.
 
-    Args:
-        name: of the file.
-        offset: where that was noticed [bytes].
-        what: what is wrong there: `file.damaged` says it in words.
-        part: of the file.
-        why: the cause, if known.
-        lost: whether nothing can be saved.
+    `offset` is where that was noticed [bytes]; `what` is wrong there, which `file.damaged` says in
+    words; `lost`: nothing can be saved.
     """
 
     def __init__(
@@ -246,9 +241,7 @@ def again(known: Schema | Channel, other: Schema | Channel) -> BadRecord:
 def chunk_records(data: bytes, *, cut: bool = False) -> Iterator[Schema | Channel | Messages]:
     """Yield the schemas and channels of a decompressed chunk, then its messages.
 
-    Args:
-        data: the chunk's content.
-        cut: its end is missing: stop at the first incomplete record.
+    `cut`: its end is missing; stop at the first incomplete record.
     """
     positions, pos, end = list[int](), 0, len(data)
     while pos < end:

@@ -71,11 +71,9 @@ def encode_doubles(values: Array) -> list[bytes]:
 
 
 def encode_lists(lists: Sequence[Array]) -> list[bytes]:
-    """Return messages of packed lists of doubles.
+    """Return messages of packed lists of doubles, (N, count) per field, a row for each message.
 
-    Args:
-        lists: one array (N, count) per field, with a row for each message; a field with count 0
-            is left out.
+    A field with count 0 is left out.
     """
     fields = enumerate(lists, start=1)
     return _joined([(doubles_tag(n, v.shape[1]), v) for n, v in fields if v.shape[1]])
@@ -98,14 +96,8 @@ def uniform_doubles(
 ) -> list[Array] | None:
     """Decode messages that all have exactly these fields in this order, as ours have.
 
-    Args:
-        buffer: the bytes.
-        start: where each message starts, (N,).
-        end: where it ends, (N,).
-        fields: the tag of each field, and the number of doubles after it.
-
-    Returns:
-        The numbers of each field, (N, count); None if the messages differ from this.
+    Message i of N is buffer[start[i]:end[i]]; a field is its tag, and the number of doubles after
+    it. Returns the numbers of each field, (N, count); None if the messages differ from this.
     """
     sizes = [size for tag, count in fields for size in (len(tag), 8 * count)]
     if not len(start) or (end - start != sum(sizes)).any():

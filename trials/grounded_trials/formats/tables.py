@@ -145,13 +145,10 @@ def ulog_tables(path: Path, layout: Layout = AS_IT_SAYS) -> Tables:
 def table_records(
     tables: Mapping[str, Columns], kind: str, path: Path, rate: float = 0.0
 ) -> Iterator[Record]:
-    """Yield tables as records, one topic per table.
+    """Yield tables, columns by topic, as records, one topic per table.
 
-    Args:
-        tables: columns by topic, equally long, one of them with the times.
-        kind: of the file, such as "csv".
-        path: of the file, for messages.
-        rate: of the rows [Hz], whatever times they have; 0: a column has their times.
+    `kind` is that of the file, such as "csv"; `rate` that of the rows [Hz], whatever times they
+    have; 0: a column has their times.
     """
     if not tables:
         raise refused("file.no_times", path)

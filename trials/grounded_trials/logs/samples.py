@@ -199,15 +199,9 @@ def at_rest(leads: Mapping[str, Lead | None], rates: Sequence[str]) -> bool:
 def tidy(name: str, series: Series, *, unwrap: bool) -> Samples:
     """Return the usable samples of a signal: sorted, finite, scaled, unwrapped.
 
-    They are kept with the raw samples: a run is sought at many instants of a log.
-
-    Args:
-        name: of the signal, for messages.
-        series: its raw samples.
-        unwrap: unwrap it as an angle even if its spec does not say so.
-
-    Raises:
-        GroundedError: if there are none, or their clock jumps back.
+    They are kept with the raw samples, since a run is sought at many instants of a log. The name is
+    for messages; `unwrap`: as an angle even if its spec does not say so. Refused are signals
+    without samples, or with a clock that jumps back.
     """
     if (name, unwrap) not in series.tidied:
         series.tidied[name, unwrap] = _tidied(name, series, unwrap)

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 
@@ -56,17 +56,6 @@ ROUNDING = 0.03  # relative tolerance for rounding to one of STEPS
 Ask = Callable[[Guess], str]
 
 
-class SignalJson(TypedDict):
-    """A state or input that was sought in a log."""
-
-    name: str
-    path: str | None
-    sure: bool
-    reasons: list[str]
-    rivals: list[str]
-    scale: float
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Begun(Document):
     """The result of making a workspace from a log."""
@@ -106,7 +95,7 @@ class Begun(Document):
         return f"{self.workspace}: {sum(bool(g.path) for g in both)} of {len(both)} signals found"
 
     @property
-    def signals(self) -> list[SignalJson]:
+    def signals(self) -> list[dict[str, Any]]:
         """What was found of each state and input."""
         return [
             {
@@ -344,16 +333,9 @@ def _recorded(
         mapping = log_mapping(log, model.state_names, model.input_names)
         if mapping is None or not measured:
             raise refused("given.no_input", "the log", what="state")
-        grid = read_log(
-            files,
-            mapping,
-            dt,
-            states=measured,
-            angles=model.angles,
-            steps=HORIZON,
-            rest=np.zeros(len(mapping.inputs)),
-            rates=rates_of(model),
-        )
+        rest, rates = np.zeros(len(mapping.inputs)), rates_of(model)
+        how: dict[str, Any] = {"angles": model.angles, "rest": rest, "rates": rates}
+        grid = read_log(files, mapping, dt, states=measured, steps=HORIZON, **how)
     except GroundedError as error:
         zeros = {model.state_names[0]: np.zeros(HORIZON + 1)}
         return zeros, {}, (error.finding.weighing(Weight.NOTE),)

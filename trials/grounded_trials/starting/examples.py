@@ -68,21 +68,13 @@ EXAMPLES: Mapping[str, Example] = {
 
 
 def example(name: str) -> Example:
-    """Return the example of a name.
-
-    Raises:
-        GroundedError: if there is none.
-    """
+    """Return the example of a name."""
     known("example", [name], EXAMPLES)
     return EXAMPLES[name]
 
 
 def write_example(folder: Path, name: str) -> None:
-    """Write the workspace of an example; never overwrites a file.
-
-    Raises:
-        GroundedError: if the folder already holds a workspace, or can't be written.
-    """
+    """Write the workspace of an example; never overwrites a file."""
     chosen = example(name)
     task = chosen.task()
     columns = {
@@ -101,14 +93,8 @@ def write_example(folder: Path, name: str) -> None:
 def fresh_folder(folder: Path, files: Iterable[str]) -> Iterator[None]:
     """Create the folders of a workspace, and clean up if the body of the `with` statement fails.
 
-    On failure a new folder is removed; from an existing folder only `files` are removed.
-
-    Args:
-        folder: the workspace.
-        files: names of the files that the body writes; none may exist yet.
-
-    Raises:
-        GroundedError: if one of the files exists, or the folder can't be created.
+    On failure a new folder is removed; from an existing one only `files`, the names of those that
+    the body writes, of which none may exist yet.
     """
     for path in (folder / name for name in files):
         if path.exists():
@@ -146,11 +132,8 @@ rerun_incumbent = true        # repeat the best candidate after a loss within th
 def toml_of(task: Task, name: str, system: str = SIMULATED, *, explicit: bool = False) -> str:
     """Return the grounded.toml of a task, with comments.
 
-    Args:
-        task: the task.
-        name: of an example, or a line that says what it is.
-        system: the line under [system].
-        explicit: whether the start is written where the target begins there too.
+    `name` is that of an example, or a line that says what it is; `system` stands under [system];
+    `explicit`: the start is written where the target begins there too.
     """
     states, inputs = task.model.state_names, task.model.input_names
     given = np.isfinite(task.target[0]) & (not explicit)

@@ -48,17 +48,10 @@ def write_first(
 ) -> None:
     """Write grounded.toml and target.csv.
 
-    Args:
-        folder: the workspace.
-        model: its crude model.
-        dt: control interval [s].
-        columns: columns of the target, by state.
-        ranges: lowest and highest value of each signal in the log, in the model's unit.
-        table: the [log] table, as text.
-        why: why this kind of robot was chosen.
-        log: name of the log file.
-        held: states in which the robot stood at the start of the log, and the inputs that held it
-            there; may be {}.
+    `columns` are those of the target; `ranges` the lowest and highest value of each signal in the
+    log, in the model's unit; `table` is the text of [log]; `why` says why this kind of robot was
+    chosen; `held` are the states in which the robot stood at the start of the log, and the inputs
+    that held it there.
     """
     write_target(folder / "target.csv", dt, dict(columns))
     weights = usual_weights(model, columns)

@@ -76,11 +76,7 @@ class OwnModel:
 
 
 def own_model(file: str | Path) -> OwnModel:
-    """Load the user's model: a Python file that defines `model`, or an MJCF or URDF file.
-
-    Raises:
-        GroundedError: if the file does not exist, or holds no model.
-    """
+    """Load the user's model: a Python file that defines `model`, or an MJCF or URDF file."""
     file = Path(file)
     if not file.is_file():
         raise refused("file.missing", file, where="--model")

@@ -382,10 +382,8 @@ SAME_UNIT = "the same"
 def _readings(slope: float, stated: Sequence[str], by: Sequence[float]) -> Iterator[_Reading]:
     """Yield the readings of a position and its rate that agree in size, most plausible first.
 
-    Args:
-        slope: how many times as large the rate is as the derivative, in the model's units.
-        stated: the units that the log states for the two, "" for none.
-        by: the factors from these to the model's units.
+    `slope` is how many times as large the rate is as the derivative, in the model's units; `stated`
+    are the units that the log states for the two, "" for none, and `by` the factors from these.
     """
     tried: list[_Reading] = [
         (1.0, 1.0, None, ""),

@@ -52,11 +52,8 @@ def mapping_toml(
 ) -> str:
     """Format guesses as a [log] table, with comments where a person should check.
 
-    Args:
-        states: one guess for each state.
-        inputs: one guess for each input.
-        simulated: whether header stamps are on another clock than the log.
-        layout: what the log's table does not say.
+    `simulated`: header stamps are on another clock than the log; `layout` is what the log's table
+    does not say.
     """
     clock = "log" if simulated else "header"
     lines = ["[log]", f'clock = "{clock}"']
