@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import inspect
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+import tomllib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.resources import files
 from pathlib import Path
 from types import ModuleType
 
@@ -25,13 +27,13 @@ from grounded_trials.workspace.user_files.task_file import target_text
 
 @dataclass(frozen=True)
 class Example:
-    """One example: its line in the list, and the sources of its files."""
+    """One example of `examples.toml`: its line in the list, and the sources of its files."""
 
     text: str
     model: str  # module of the crude model, copied to model.py
     real: str  # template of real.py
     tasks: str  # module and function (..., model) of its task
-    arguments: tuple[str, ...] = ()
+    arguments: Sequence[str] = ()
 
     def task(self) -> Task:
         """Return the task with the crude model."""
@@ -45,26 +47,12 @@ class Example:
         return import_module(self.model)
 
 
-_CAR = "grounded.models.car", "real_car.py", "grounded.experiments.car_tasks.car_task"
-EXAMPLES: Mapping[str, Example] = {
-    "car-turn": Example("RC car, open loop: a quarter turn from standstill", *_CAR, ("turn",)),
-    "car-circle": Example("RC car, closed loop: 1.4 m/s on a 1 m circle", *_CAR, ("circle",)),
-    "car-figure8": Example(
-        "RC car, closed loop: a figure-8, 1.4 m/s straights, 1.0 m/s turns", *_CAR, ("figure8",)
-    ),
-    "flight-figure8": Example(
-        "fixed-wing aircraft, 60 s: a figure-8 at fixed altitude",
-        "grounded.models.aircraft",
-        "real_aircraft.py",
-        "grounded.experiments.figure8.flight_task",
-    ),
-    "pendulum": Example(
-        "pendulum: swing up to standing, the smallest example",
-        "grounded.models.pendulum",
-        "real_pendulum.py",
-        "grounded.experiments.pendulum.pendulum_task",
-    ),
-}
+def _examples() -> dict[str, Example]:
+    text = files(__package__).joinpath("examples.toml").read_text("utf-8")
+    return {name: Example(**given) for name, given in tomllib.loads(text).items()}
+
+
+EXAMPLES: Mapping[str, Example] = _examples()
 
 
 def example(name: str) -> Example:

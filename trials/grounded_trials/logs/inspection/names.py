@@ -1,57 +1,22 @@
-"""How well the name of a number fits a state or input: usual names, in any order of words."""
+"""How well the name of a number fits a state or input: usual names, in any order of words.
+
+The usual names stand in `names.toml`.
+"""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections.abc import Iterable, Sequence
+from importlib.resources import files
 
-from grounded_trials.formats.message_path import AXES, WORLD
 from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
 from grounded_trials.logs.stated_units import bare_command, without_role, without_unit
 
 MEASURED = ("/Odometry", "/Imu")  # messages that hold no commands
 
-_YAW = ("@rpy.yaw", "yaw", "heading", "theta", "psi")
-_TURN = ("@rpy.pitch", "@rpy.yaw", "theta", "angle", "pitch", "tilt", "lean")
-_MEANINGS: dict[str, tuple[str, ...]] = {
-    "x": ("position.x", "translation.x", "x", "north", "northing", "east", "easting", "x0", "pos"),
-    "y": ("position.y", "translation.y", "y", "east", "easting", "north", "northing", "y0"),
-    "z": ("position.z", "translation.z", "z", "altitude", "height"),
-    "psi": _YAW,
-    "yaw": _YAW,
-    "heading": _YAW,
-    "theta": _TURN,
-    "th": _TURN,
-    "pitch": ("@rpy.pitch", "pitch", "theta", "tilt", "lean"),
-    "pitch_rate": (
-        *("angular.y", "angular_velocity.y", "pitch_rate", "pitch_velocity"),
-        *("tilt_rate", "lean_rate"),
-    ),
-    "phi": ("@rpy.roll", "roll", "phi"),
-    "roll": ("@rpy.roll", "roll", "phi"),
-    **{f"v{axis}": (f"@{WORLD}.{axis}", f"linear.{axis}", f"v{axis}") for axis in AXES},
-    "v": ("linear.x", "speed", "velocity", "vel", "v"),
-    "speed": ("speed", "linear.x", "velocity", "vel", "v"),
-    "u": ("linear.x", "u", "surge"),
-    "w": ("linear.z", "w", "heave"),
-    "p": ("angular.x", "angular_velocity.x", "p"),
-    "q": ("angular.y", "angular_velocity.y", "q"),
-    "r": ("angular.z", "angular_velocity.z", "yaw_rate", "r"),
-    "omega": ("angular.z", "angular_velocity.z", "yaw_rate", "omega"),
-    "yaw_rate": ("angular.z", "angular_velocity.z", "yaw_rate"),
-    "delta": ("steering_angle", "delta", "steering"),
-    "steering": ("steering", "steering_angle", "steer", "delta", "angular.z"),
-    "turn": ("turn", "angular.z", "angular_velocity.z", "turn_rate", "yaw_rate", "omega", "w"),
-    "throttle": ("throttle", "gas", "accelerator", "acceleration", "motor"),
-    "thrust": ("thrust", "force.z", "throttle"),
-    "torque": ("torque", "effort", "tau"),
-}
-NAMES_BY_UNIT: dict[str, tuple[str, ...]] = {  # further names of an input by its unit
-    "V": ("voltage", "volts", "volt"),
-    "A": ("current", "amps", "ampere"),
-    "N m": ("torque", "effort", "tau"),
-    "N": ("force", "thrust"),
-}
+_NAMES = tomllib.loads(files(__package__).joinpath("names.toml").read_text("utf-8"))
+_MEANINGS: dict[str, list[str]] = _NAMES["meanings"]
 _BESIDE_U = ("linear.y", "v", "sway")  # meaning of v beside a state u: sway, not the speed
 _COMPASS = (("north", "northing"), ("east", "easting"))  # axes of a plane; either may be x
 _COMMANDED = (
@@ -81,7 +46,7 @@ def meanings(name: str, unit: str, paths: Iterable[str], states: Sequence[str]) 
     said = {without_unit(path).lower().rpartition(".")[2] for path in paths}
     plane = all(said.intersection(axis) for axis in _COMPASS)
     left = () if plane else {one for axis in _COMPASS for one in axis}
-    usual = (*_MEANINGS.get(name, (name,)), *NAMES_BY_UNIT.get(unit, ()))
+    usual = (*_MEANINGS.get(name, (name,)), *_NAMES["units"].get(unit, ()))
     return (name.lower(), *(one for one in usual if one not in left))
 
 
