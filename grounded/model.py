@@ -321,15 +321,19 @@ class Model:
 
         NaN where the function raises an arithmetic error.
         """
+        try:
+            return self.whole.steps(x, u, self.values, dt)
+        except Exception:  # the compiler says what is wrong with the function
+            return self.system.step(x, u, self.values, dt)
+
+    @property
+    def whole(self) -> Signature:
+        """The function as a step(s, a, p, dt); a derivative is integrated."""
         function = self.derivative or self.step
         assert function is not None
         kind: Kind = "derivative" if self.derivative else "step"
         names = (self.state_names, self.input_names, self.param_names)
-        signature = Signature(function, kind, *names).whole(self.integrator, self.substeps)
-        try:
-            return signature.steps(x, u, self.values, dt)
-        except Exception:  # the compiler says what is wrong with the function
-            return self.system.step(x, u, self.values, dt)
+        return Signature(function, kind, *names).whole(self.integrator, self.substeps)
 
     def difference(self, a: Array, b: Array) -> Array:
         """Return the difference a - b of states (..., n), with angles wrapped to [-pi, pi]."""

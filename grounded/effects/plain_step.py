@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from grounded.compile.names import Named, check_names
-from grounded.compile.problem import integrated
 from grounded.effects.family import Effect, Family, InputFamily, MemoryFamily, Values
 from grounded.model import Model
 
@@ -16,24 +15,14 @@ Step = Callable[[Any, Any, Any, Any], dict[str, Any]]
 
 def plain_step(model: Model) -> Step:
     """Return the model's step(s, a, p, dt) in named values; a derivative is integrated."""
-    stepped, derivative, names = model.step, model.derivative, model.state_names
-
-    def checked(function: Callable[..., Any], *at: Any) -> dict[str, Any]:
-        check_names(values := function(*at), names, function)
-        return dict(values)
-
-    if stepped is not None:
-        return lambda s, a, p, dt: checked(stepped, s, a, p, dt)
-    assert derivative is not None
+    whole = model.whole
 
     def step(s: Any, a: Any, p: Any, dt: Any) -> dict[str, Any]:
-        def rate(at: list[Any]) -> list[Any]:
-            values = checked(derivative, Named("state", names, at), a, p)
-            return [values[n] for n in names]
-
-        start = [s[n] for n in names]
-        after = integrated(rate, start, dt, model.integrator, model.substeps)
-        return dict(zip(names, after, strict=True))
+        each = ((s, whole.states), (a, whole.inputs), (p, whole.params))
+        x, u, values = ([of[name] for name in names] for of, names in each)
+        after = whole.call(x, u, values, dt)
+        check_names(after, whole.states, whole.function)
+        return dict(after)
 
     return step
 

@@ -91,11 +91,6 @@ def _periodic_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Valu
     return {site.target: wave + 0.0 * s[site.target]}
 
 
-def _slew_rate(s: Any, a: Any, own: Any, t: Any, c: Any, site: Site) -> Values:
-    rate = own[site.target]
-    return {site.target: -beyond(rate, c["r"])}
-
-
 offset = RateFamily(
     name="offset",
     loose=True,
@@ -176,7 +171,7 @@ slew_limit = RateFamily(
     targets=places.following,
     quantities=lambda site: speed_limit(site, per_second(site.unit(site.target))),
     lookalikes=("rate_limit", "first_order_lag", "saturation"),
-    rate=_slew_rate,
+    rate=lambda s, a, own, t, c, site: {site.target: -beyond(own[site.target], c["r"])},
     needs_own=True,
     parts=4,
 )
@@ -210,15 +205,6 @@ def _opposing(site: Site, name: str, unit: str, power: int) -> Quantity:
     return Quantity(name, unit, low=_least(site, power), high=10 * most, absurd=most)
 
 
-def _viscous(site: Site) -> tuple[Quantity, ...]:
-    return (_opposing(site, "k", "1/s", 1),)
-
-
-def _coulomb(site: Site) -> tuple[Quantity, ...]:
-    dry = _opposing(site, "c", per_second(site.unit(site.target)), 0)
-    return (dry, width(site, site.target))
-
-
 def _quadratic(site: Site) -> tuple[Quantity, ...]:
     unit = site.unit(site.target)
     squared = {"m/s": "1/m", "rad/s": "1/rad"}.get(unit, f"1/({unit} s)")
@@ -246,7 +232,7 @@ viscous_friction = RateFamily(
     equation="v' = model - k v",
     sentence="{target} is damped {k>by|less than modelled, by} {k}",
     targets=places.velocities,
-    quantities=_viscous,
+    quantities=lambda site: (_opposing(site, "k", "1/s", 1),),
     lookalikes=("quadratic_drag", "coulomb_friction", "input_gain", "parameter"),
     rate=lambda s, a, own, t, c, site: {site.target: -c["k"] * s[site.target]},
     brakes=True,
@@ -257,7 +243,10 @@ coulomb_friction = RateFamily(
     equation="v' = model - c sign(v)",
     sentence="{target} is opposed by {c>a dry friction of|less dry friction than modelled, by} {c}",
     targets=places.velocities,
-    quantities=_coulomb,
+    quantities=lambda site: (
+        _opposing(site, "c", per_second(site.unit(site.target)), 0),
+        width(site, site.target),
+    ),
     lookalikes=("dead_zone", "viscous_friction", "offset", "stiction"),
     rate=lambda s, a, own, t, c, site: {
         site.target: -c["c"] * np.tanh(s[site.target] / c["width"])
@@ -310,11 +299,6 @@ def bells(r: Any, lo: Any, hi: Any) -> list[Any]:
     return [one / total for one in found]
 
 
-def _any_pair(model: Any) -> list[str]:
-    sources = [*model.state_names, *model.input_names]
-    return [f"{s}<-{r}" for s in model.state_names for r in sources]
-
-
 def _weights(site: Site) -> tuple[Quantity, ...]:
     target, source = coupled(site)
     ends = [Quantity(n, site.unit(source), fixed=True) for n in ("lo", "hi")]
@@ -331,7 +315,9 @@ correction = RateFamily(
     name="correction",
     equation="s' = model + curve(r)   (s<-r)",
     sentence="{driven} lacks a rate that depends on {source}: a correction, not a cause",
-    targets=_any_pair,
+    targets=lambda model: [
+        f"{s}<-{r}" for s in model.state_names for r in (*model.state_names, *model.input_names)
+    ],
     quantities=_weights,
     rate=_curve_rate,
 )
