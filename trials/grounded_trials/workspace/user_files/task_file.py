@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from grounded.checks import known, one_of, refused, unknown, wrong
+from grounded.checks import known, one_of, refused, wrong
 from grounded.errors import GroundedError, NextCommand
 from grounded.frozen import Array
 from grounded.model import Model
@@ -53,12 +53,13 @@ def _build(config: Config, model: Model, folder: Path) -> Task:
         target, input_target = np.full((table.horizon + 1, len(states)), np.nan), None
     first = np.where(np.isfinite(target[0]), target[0], 0.0)
     start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
-    low, high = _limits(config, inputs)
+    limits, safety = config.limits.pairs(inputs), config.safety.pairs(states)
+    free = (-np.inf, np.inf)
+    low, high = np.array([limits.get(name, free) for name in inputs]).T
+    safe_low, safe_high = np.array([safety.get(name, free) for name in states]).T
     held = np.zeros(len(inputs)) if input_target is None else input_target[0]
     aimed = np.clip(held, low, high)  # default of the input held before a run
     past = np.array([table.start.get(name, aimed[i]) for i, name in enumerate(inputs)])
-    safety = config.safety.pairs(states)
-    safe = np.array([safety.get(s, (-np.inf, np.inf)) for s in states])
     return Task(
         model=model,
         dt=table.dt,
@@ -71,16 +72,10 @@ def _build(config: Config, model: Model, folder: Path) -> Task:
         feedback=table.feedback,
         latency=np.array([table.latency.get(name, 0.0) for name in inputs]),
         input_target=input_target,
-        safety_low=safe[:, 0],
-        safety_high=safe[:, 1],
+        safety_low=safe_low,
+        safety_high=safe_high,
         smoothing=config.model.smoothing,
     )
-
-
-def _limits(config: Config, inputs: list[str]) -> tuple[Array, Array]:
-    pairs = config.limits.pairs(inputs)
-    both = np.array([pairs.get(name, (-np.inf, np.inf)) for name in inputs])
-    return both[:, 0], both[:, 1]
 
 
 def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
@@ -125,8 +120,14 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
             for line, row in enumerate(reader, start=2):
                 if len(rows) > ROW_LIMIT:
                     raise unreadable(path.name, f"> {ROW_LIMIT} rows")
-                if any(cell.strip() for cell in row):
-                    rows.append(_numbers(path, line, names, row, free))
+                if not any(cell.strip() for cell in row):
+                    continue
+                if len(row) != len(names):
+                    sizes = {"line": line, "has": len(row), "names": len(names)}
+                    raise refused("file.row", path.name, **sizes)
+                where = f"{path.name} line {line}"
+                cells = zip(names, row, strict=True)
+                rows.append([_number(f"{where}: '{n}'", cell, n in free) for n, cell in cells])
     except FileNotFoundError:
         raise refused("file.missing", path, where="[task] target") from None
     except IsADirectoryError:
@@ -136,22 +137,14 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
     return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
 
 
-def _numbers(
-    path: Path, line: int, names: list[str], row: list[str], free: Collection[str]
-) -> list[float]:
-    if len(row) != len(names):
-        sizes = {"line": line, "has": len(row), "names": len(names)}
-        raise refused("file.row", path.name, **sizes)
-    values = []
-    for name, cell in zip(names, row, strict=True):
-        try:
-            value = float(cell)
-        except ValueError:
-            raise wrong(f"{path.name} line {line}: '{name}'", cell, must="number") from None
-        if not math.isfinite(value) and name not in free:
-            raise wrong(f"{path.name} line {line}: '{name}'", cell, must="finite", do="omit")
-        values.append(value)
-    return values
+def _number(what: str, cell: str, may_be_free: bool) -> float:
+    try:
+        value = float(cell)
+    except ValueError:
+        raise wrong(what, cell, must="number") from None
+    if not (may_be_free or math.isfinite(value)):
+        raise wrong(what, cell, must="finite", do="omit")
+    return value
 
 
 def target_arrays(
@@ -159,34 +152,22 @@ def target_arrays(
 ) -> tuple[Array, Array | None]:
     """Return the target (H + 1, n), NaN where free, and the inputs' target (H, m) or None."""
     names, values = read_target(path)
-    for name in names[1:]:
-        if name not in states and name not in inputs:
-            there = [*states, *inputs]
-            raise unknown("state or input", name, there, "the model", where=path.name)
+    known("state or input", names[1:], [*states, *inputs], "the model", path.name)
+    there = str(len(values))
     if len(values) < 2:
-        raise refused("file.rows", path.name, rows=str(len(values)), needs=2, target=1, then=SHAPE)
+        raise refused("file.rows", path.name, rows=there, needs=2, target=1, then=SHAPE)
     if len(values) < horizon + 1:
-        sizes = {"rows": str(len(values)), "needs": horizon + 1, "horizon": len(values) - 1}
+        sizes = {"rows": there, "needs": horizon + 1, "horizon": len(values) - 1}
         raise refused("file.rows", path.name, **sizes)
-    t = values[: horizon + 1, 0]
-    off = np.abs(t - t[0] - dt * np.arange(horizon + 1))
-    if off.max() > 0.01 * dt:
-        i = int(np.argmax(off > 0.01 * dt))
+    t, at = values[: horizon + 1, 0], values[0, 0] + dt * np.arange(horizon + 1)
+    for i in np.flatnonzero(np.abs(t - at) > 0.01 * dt)[:1]:
         each = float(values[-1, 0] - values[0, 0]) / (len(values) - 1)
-        facts = {
-            "each": each,
-            "sample": f"of line {i + 2}",
-            "at": t[i],
-            "expected": t[0] + i * dt,
-            "dt": dt,
-        }
+        facts = {"each": each, "sample": f"of line {i + 2}", "at": t[i], "expected": at[i]}
         then = NextCommand("target", (str(path),))
-        raise refused("file.grid", path.name, then=then, **facts)
-    target = np.full((horizon + 1, len(states)), np.nan)
+        raise refused("file.grid", path.name, then=then, dt=dt, **facts)
     given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
-    for i, name in enumerate(states):
-        if name in given:
-            target[:, i] = given[name]
+    nothing = np.full(horizon + 1, np.nan)
+    target = np.stack([given.get(name, nothing) for name in states], axis=1)
     if not any(name in given for name in inputs):
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
@@ -195,11 +176,11 @@ def target_arrays(
 
 def limited_changes(config: Config, model: Model) -> dict[str, tuple[float, float]]:
     """Return the weights on changes of inputs with [limits]: (ignoring the limits, using them)."""
-    both = zip(*_limits(config, list(model.input_names)), model.inputs.items(), strict=True)
+    limits = config.limits.pairs(model.input_names)
     return {
-        name: (change_weight(None, unit), float(f"{change_weight((low, high), unit):.4g}"))
-        for low, high, (name, unit) in both
-        if math.isfinite(high - low)
+        name: (change_weight(None, unit), float(f"{change_weight(limits[name], unit):.4g}"))
+        for name, unit in model.inputs.items()
+        if name in limits
     }
 
 
