@@ -13,7 +13,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +26,6 @@ from grounded.errors import needs
 from grounded.result import UNSAID, Document
 from grounded_trials.workspace.folder import Folder
 
-Lost = list[tuple[str, dict[str, Estimate]]]  # effects with their values
 Key = tuple[str, int, str]  # kind of element, its index in MjModel, field
 # relative change of a joint's inertia with the pose below which it is constant
 INERTIA_CONSTANT = 2e-3
@@ -62,38 +61,35 @@ class Number(Value):
 class Held:
     """Collects the numbers of a file that parameters and effects change."""
 
-    def __init__(
-        self, stepper: MujocoStepper, file: Any, params: Mapping[str, tuple[float, float]]
-    ) -> None:
-        """Start with the model's own parameters: value and standard deviation of each."""
-        self.mj, self.stepper, self.file = needs("mujoco"), stepper, file
+    def __init__(self, workspace: Folder, values: Mapping[str, Estimate]) -> None:
+        """Collect what the file of a workspace's model holds now; `lost` are effects that it can't.
+
+        Args:
+            workspace: the workspace, whose model MuJoCo computes from a file.
+            values: parameters and quantities of effects by name, with their +-.
+        """
+        step, latency = workspace.base_model.step, workspace.config.task.latency
+        assert isinstance(step, MujocoStepper) and step.source is not None
+        self.mj, self.stepper, self.file = needs("mujoco"), step, load(step.source)
         self.now = copy.deepcopy(self.file)
         self._delta = dict[Key, tuple[float, float]]()  # what is added, and its variance
-        for setting in stepper.settings:
-            value, std = params[setting.name]
-            setting.write(self.now, value)
+        for setting in step.settings:
+            one = values[setting.name]
+            setting.write(self.now, one.value)
             element, _, field = setting.spec.rpartition(".")
             kind = FIELDS[field].element
             index = self.mj.mj_name2id(self.file, _object(self.mj, kind), element)
-            if value != setting.nominal:
-                self.add(kind, index, field, value - setting.nominal, std)
+            if one.value != setting.nominal:
+                self.add(kind, index, field, one.value - setting.nominal, one.std)
         self.mj.mj_setConst(self.now, self.mj.MjData(self.now))
-
-    @classmethod
-    def of(cls, workspace: Folder, values: Mapping[str, Estimate]) -> tuple[Self, Lost]:
-        """Return what the file of a workspace's model holds now, and the effects that it can't."""
-        step, latency = workspace.base_model.step, workspace.config.task.latency
-        assert isinstance(step, MujocoStepper) and step.source is not None
-        own = {s.name: (values[s.name].value, values[s.name].std) for s in step.settings}
-        held = cls(step, load(step.source), own)
-        late = {
-            n: latency.get(n, 0.0) - step.latency.get(n, 0.0) for n in {**step.latency, **latency}
-        }
-        found = {f"delay:{n}": {"d": Estimate(d, 0.0, unit="s")} for n, d in late.items() if d}
-        pairs = [*found.items()]
+        pairs = [
+            (f"delay:{name}", {"d": Estimate(late, 0.0, unit="s")})
+            for name in {**step.latency, **latency}
+            if (late := latency.get(name, 0.0) - step.latency.get(name, 0.0))
+        ]
         for name, its in workspace.config.model.effects.items():
             pairs.append((name, {q: values[param_name(name, q)] for q in its}))
-        return held, [(name, c) for name, c in pairs if not held.adopt(name, c)]
+        self.lost = [(name, c) for name, c in pairs if not self.adopt(name, c)]
 
     def add(self, kind: str, index: int, field: str, by: float, std: float) -> None:
         """Add to a number."""

@@ -206,7 +206,7 @@ def _of_file(
     workspace: Folder, known: Mapping[str, Estimate], name: str, drives: str
 ) -> Iterator[tuple[str, Estimate]]:
     """Yield the changed numbers of an actuator's joint in an MJCF, in the unit of its command."""
-    held, _ = Held.of(workspace, known)
+    held = Held(workspace, known)
     dof, push = held.dof(drives) if drives else -1, held.push(name)
     for one in held.numbers if dof >= 0 and push else ():
         if one.kind == "joint" and one.index == held.file.dof_jntid[dof] and one.field in HELD:

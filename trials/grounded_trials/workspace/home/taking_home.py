@@ -73,8 +73,8 @@ def export_model(workspace: Folder, path: str | Path | None = None) -> TakenHome
 
 def _simulated(workspace: Folder, source: Path, path: Path) -> TakenHome:
     """Write an MJCF or URDF file."""
-    held, open_ = Held.of(workspace, known_values(workspace))
-    lost = [_not_held(name, c) for name, c in open_]
+    held = Held(workspace, known_values(workspace))
+    lost = [_not_held(name, c) for name, c in held.lost]
     urdf = XmlText(source.read_bytes(), str(source)).root.tag == "robot"
     numbers = {one.name: one for one in held.numbers}
     while True:  # again without what the written file does not compile to
