@@ -10,6 +10,7 @@ from __future__ import annotations
 import ast
 import datetime
 import os
+import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,6 +33,7 @@ from grounded_trials.workspace.home.held import Held, Number, Value, value_of
 from grounded_trials.workspace.home.mjcf import Mjcf, Urdf, XmlText, commented
 from grounded_trials.workspace.user_files.model_file import load_module
 
+FIRST = re.compile(r"(?:(?:#!.*|#.*coding.*)\n){0,2}")  # how to run and to read a Python file
 WRITTEN = 1e-4  # relative difference of a value from the one that the written file compiles to
 
 
@@ -145,21 +147,11 @@ def _python(workspace: Folder, source: Path, path: Path) -> TakenHome:
     for name, own in workspace.config.model.effects.items():
         told.append(_not_held(name, {q: values[param_name(name, q)] for q in own}))
     date, comment = _comment(workspace, taken, told)
-    head, rest = _head(text)
+    first = FIRST.match(text)
+    head = first[0] if first else ""
     lines = "".join(f"# {line}".rstrip() + "\n" for line in comment)
-    write_atomically(path, f"{head}{lines}{rest}".encode())
+    write_atomically(path, f"{head}{lines}{text[len(head) :]}".encode())
     return TakenHome(path, source, date, taken, settle(told))
-
-
-def _head(text: str) -> tuple[str, str]:
-    """Split off the lines that must come first in a Python file: how to run and to read it."""
-    lines = text.splitlines(keepends=True)
-    first = 0
-    while first < min(2, len(lines)) and (
-        lines[first].startswith("#!") or "coding" in lines[first]
-    ):
-        first += 1
-    return "".join(lines[:first]), "".join(lines[first:])
 
 
 def _comment(
