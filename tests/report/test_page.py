@@ -15,10 +15,10 @@ from grounded.diagnosis.parts import Diagnosis
 from grounded.errors import NextCommand
 from grounded.findings import found
 from grounded_cli.report import report_text
-from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.png import png
 from grounded_trials.report.figures.runs import all_figures, error_figure, state_figure
 from grounded_trials.report.findings import ESTIMATED
+from grounded_trials.report.forecast import forecast_figures
 from grounded_trials.report.gathering import RUNAWAY, gather
 from grounded_trials.report.page import page
 from grounded_trials.store.store import Lost

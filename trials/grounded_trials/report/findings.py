@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.diagnosis.error_report import furthest
 from grounded.diagnosis.parts import Diagnosis
 from grounded.diagnosis.telling import Told, sentence, told
 from grounded.errors import NextCommand
@@ -21,11 +20,9 @@ from grounded.frozen import Array
 from grounded.result import begun
 from grounded.search.candidate import Candidate, Tried
 from grounded.search.pictures import few
-from grounded.search.planner import Planner
 from grounded.search.standing import Standing
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded_trials.report.forecast import SECONDS
 from grounded_trials.store.store import Lost
 from grounded_trials.wording import rendered
 from grounded_trials.workspace.last_diagnosis import Since
@@ -117,30 +114,6 @@ class Findings:
         return self.told.next
 
     @property
-    def ahead_s(self) -> float:
-        """Horizon of the prediction errors shown [s]: a second, or less if the diagnosis used less.
-
-        A diagnosis uses shorter horizons for unstable systems, which can't be predicted for long.
-        """
-        rows = () if self.diagnosis is None else self.diagnosis.prediction_error
-        row = furthest(rows)
-        return SECONDS if row is None else min(SECONDS, row.horizon_s)
-
-    @property
-    def crude(self) -> Planner:
-        """The task with the crude model."""
-        return Planner(self.task, self.task)
-
-    @property
-    def plain(self) -> str:
-        """The name of the task's model, which contains no adopted effects."""
-        params = self.task.model.params
-        changed = any(params[name].value != value for name, value in self.nominal.items())
-        return f"{'present' if changed else 'crude'} model" + ", without effects" * bool(
-            self.effects
-        )
-
-    @property
     def history(self) -> tuple[Tried, ...]:
         """Every candidate with its trials, in order of proposal."""
         return self.standing.history
@@ -159,11 +132,6 @@ class Findings:
     def best(self) -> Run | None:
         """The latest run of the best candidate so far."""
         return self._latest(self.standing.incumbent)
-
-    @cached_property
-    def lately(self) -> Run | None:
-        """The latest run of the best candidate, else the latest run."""
-        return self.best or (self.runs[-1] if self.runs else None)
 
     def improvements(self, most: int) -> list[Run]:
         """Return a run of at most `most` accepted candidates, the model's policy first."""

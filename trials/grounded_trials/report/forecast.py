@@ -10,14 +10,22 @@ from dataclasses import replace
 
 import numpy as np
 
+from grounded.diagnosis.error_report import furthest
+from grounded.figures import Figure, calm_range, curve, panel
 from grounded.frozen import Array
 from grounded.places import true_values
 from grounded.rollout import augmented
 from grounded.search.planner import Planner
 from grounded.solve.bias import residuals
 from grounded.trial import Trial
+from grounded_trials.report.bodies import reading_order
+from grounded_trials.report.findings import ESTIMATED, Findings, Log, Run
+from grounded_trials.wording import labelled, shown
 
-SECONDS = 1.0
+SECONDS = 1.0  # of a forecast, if the diagnosis has no shorter horizon
+SPAN_S = 30.0  # [s] of a long log that are drawn, where the errors are largest
+LOGS = 2  # number of logs drawn; the table has all
+RESTARTED = "Predictions restarted every"
 
 
 def forecast(planner: Planner, trial: Trial, seconds: float = SECONDS) -> tuple[Array, Array]:
@@ -65,3 +73,87 @@ def anchored(planner: Planner, trial: Trial) -> Trial:
     drift, states = residuals(planner.plan, lifted), np.array(lifted.states)
     states[1:, list(behind)] += drift[:, list(behind.values())]
     return replace(lifted, states=states)
+
+
+# its figures
+
+
+def forecast_figures(findings: Findings) -> list[Figure]:
+    """Return forecasts of a run unknown to the diagnosis, else of the best; and of long logs."""
+    drawn, ahead = list[tuple[str, str, Run | Log]](), _ahead_s(findings)
+    if (run := forecast_run(findings)) is not None:
+        drawn = [("forecast", run.label, run)]
+    longest = sorted(findings.logs, key=lambda log: -log.trial.finite_steps)[:LOGS]
+    drawn += [(f"data-{log.trial.id}", f"data {log.trial.id}", log) for log in longest]
+    return [
+        _figure(findings, name, f"{RESTARTED} {ahead:.3g} s, {of}", one, ahead)
+        for name, of, one in drawn
+        if one.trial.finite_steps > 0
+    ]
+
+
+def forecast_run(findings: Findings) -> Run | None:
+    """Return the latest run that the diagnosis did not use, else the latest of the best one."""
+    made = findings.diagnosis.made if findings.diagnosis is not None else None
+    fresh = [r for r in findings.runs if made is not None and r.trial.id not in made.trials]
+    if fresh or findings.best is None:
+        return next(reversed(fresh or findings.runs), None)
+    return findings.best
+
+
+def _ahead_s(findings: Findings) -> float:
+    """Return a second, or less if the diagnosis predicts less far, as for unstable systems."""
+    row = furthest(() if findings.diagnosis is None else findings.diagnosis.prediction_error)
+    return SECONDS if row is None else min(SECONDS, row.horizon_s)
+
+
+def _figure(findings: Findings, name: str, title: str, of: Run | Log, ahead_s: float) -> Figure:
+    trial, begin = _worst_part(of)
+    task = findings.task
+    changed = any(task.model.params[n].value != value for n, value in findings.nominal.items())
+    own = f"{'present' if changed else 'crude'} model" + ", without effects" * bool(
+        findings.effects
+    )
+    models = [("model", own, forecast(Planner(task, task), trial, ahead_s))]
+    if (better := findings.better) is not None:
+        models.append(("best", f"model {better.name}", forecast(better.planner, trial, ahead_s)))
+
+    # a panel for each state
+    times = np.arange(trial.steps + 1, dtype=np.float64) * trial.dt + begin
+    panels = []
+    for i in reading_order(task):
+        state, unit = list(task.model.states.items())[i]
+        real = curve(times, trial.states[:, i], "real", "real")
+        made = [curve(t + begin, x[:, i], role, words, 1.2) for role, words, (t, x) in models]
+        panels.append(
+            panel(
+                labelled(state, unit),
+                "time [s]",
+                shown(unit),
+                [real, *made],
+                y_range=calm_range([real["y"]], [one["y"] for one in made]),
+                note=ESTIMATED * (state in findings.estimated),
+                kind="forecast",
+            )
+        )
+
+    # what of which trial is drawn
+    said, used = [], findings.diagnosis.made if findings.diagnosis is not None else None
+    if used is not None and better is not None and trial.id not in used.trials:
+        said.append("held out")
+    if trial.steps < of.trial.finite_steps:
+        said.append(f"{begin:.4g} to {begin + trial.steps * trial.dt:.4g} s")
+    return Figure(name, title, ", ".join(said), panels)
+
+
+def _worst_part(of: Run | Log) -> tuple[Trial, float]:
+    """Return the SPAN_S of a long trial with the largest residuals, and its start [s]."""
+    trial, whole = of.trial, of.trial.finite_steps
+    span, first = min(round(SPAN_S / trial.dt), whole), 0
+    if span < whole:
+        spread = np.std(trial.states[: whole + 1], axis=0) + 1e-12
+        size = np.cumsum(np.sum((of.residual[:whole] / spread) ** 2, axis=1))
+        first = int(np.argmax(size[span:] - size[:-span])) + 1
+    held = trial.start_inputs if first == 0 else trial.inputs[first - 1]
+    states, inputs = trial.states[first : first + span + 1], trial.inputs[first : first + span]
+    return replace(trial, states=states, inputs=inputs, start_inputs=held), first * trial.dt

@@ -23,7 +23,6 @@ from grounded.frozen import Array
 from grounded.result import listed
 from grounded.search.pictures import search_figure
 from grounded_trials.report.bodies import reading_order, scene_of
-from grounded_trials.report.figures.gap import forecast_figures
 from grounded_trials.report.figures.paths import crash, name_of, named_paths, path_figure
 from grounded_trials.report.findings import (
     ESTIMATED,
@@ -32,6 +31,7 @@ from grounded_trials.report.findings import (
     compared,
     prediction_error,
 )
+from grounded_trials.report.forecast import forecast_figures
 from grounded_trials.wording import figure, labelled, per_second, shown
 from grounded_trials.workspace.off_target import asked_for, tracked, tracking_error
 
