@@ -62,7 +62,7 @@ def page(findings: Findings) -> str:
     panels: list[dict[str, Any]] = []
 
     def number(panel: Panel) -> int:
-        panels.append(_data(panel))
+        panels.append(_plain({"kind": panel.kind, "data": panel.data, "layout": panel.layout}))
         return len(panels) - 1
 
     def data() -> str:  # called after all panels have been numbered
@@ -83,7 +83,10 @@ def page(findings: Findings) -> str:
         tiles=counted(findings),
         improved=improved(findings),
         diagnose=rendered(DIAGNOSE, findings.folder),
-        why=_why(findings),
+        said=findings.told,
+        odd=[] if found is None else instrument_lines(found.preflight),
+        most=FINDINGS,
+        sentence=sentence,
         figures={one.name: one for one in all_figures(findings)},
         errors=error_table(findings),
         gain=begun(gain.to_finding().sentence) if gain else "",
@@ -97,7 +100,6 @@ def page(findings: Findings) -> str:
         scripts=scripts,
         hashes=[_hash(script) for script in scripts],
         number=number,
-        height=_height,
         data=data,
     )
 
@@ -134,10 +136,6 @@ def _hash(script: str) -> str:
     return base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
-def _data(panel: Panel) -> dict[str, Any]:
-    return {"kind": panel.kind, "data": _plain(panel.data), "layout": _plain(panel.layout)}
-
-
 def _plain(value: Any) -> Any:
     """Pack arrays, and convert NumPy numbers to Python's, in nested data."""
     if isinstance(value, dict):
@@ -150,30 +148,9 @@ def _plain(value: Any) -> Any:
     return float(value) if isinstance(value, np.floating) else typeset(value)
 
 
-def _height(panel: Panel) -> int:
-    """Return the height of a panel in the page [px]."""
-    return 420 if panel.kind == "path" else 240
-
-
 def _roles() -> str:
     """Return the style of the roles' colours, light and dark; print uses light."""
     light, dark = (
         "".join(f".{role}{{--c:{pair[k]}}}" for role, pair in PALETTE.items()) for k in (0, 1)
     )
     return f"{light}@media screen and (prefers-color-scheme: dark){{{dark}}}"
-
-
-def _why(findings: Findings) -> dict[str, Any]:
-    """Return what is told of the diagnosis; {} if undiagnosed."""
-    diagnosis, said = findings.diagnosis, findings.told
-    if diagnosis is None or said is None:
-        return {}
-    return {
-        "kind": diagnosis.kind,
-        "verdict": findings.lines,
-        "adopted": findings.adopted if len(findings.adopted) > 1 else [],
-        "causes": said.rows,
-        "header": said.header,
-        "preflight": instrument_lines(diagnosis.preflight),
-        "notes": [sentence(one) for one in said.findings[FINDINGS:]],
-    }
