@@ -177,12 +177,6 @@ def test_short_and_unfinite_trials_have_no_utility():
     assert task.utility(replace(whole, inputs=inputs)) == -np.inf
 
 
-@pytest.mark.parametrize("bad", [-1.0, np.nan, np.inf])
-def test_weights_are_finite_and_not_negative(bad):
-    with pytest.raises(GroundedError, match=holding("[reward] input")):
-        Reward(np.ones(2), np.zeros(2), np.array([bad]), np.zeros(1))
-
-
 def test_a_change_is_paid_where_it_happens():
     reward = Reward(np.zeros(1), np.zeros(1), np.zeros(1), np.array([2.0]))
     u = np.array([[0.0], [0.0], [3.0], [3.0]])
@@ -255,19 +249,25 @@ def test_a_wrong_declaration_says_what_is_wrong(change, match):
         model(**change)
 
 
-@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_parameter_is_a_number(value):
-    with pytest.raises(GroundedError, match="finite"):
-        Param(value)
+@pytest.mark.parametrize(
+    ("make", "match"),
+    [
+        *((lambda bad=bad: Param(bad), "finite") for bad in (np.nan, np.inf, -np.inf)),
+        (lambda: Param(2.0, "1", 0.0, 1.0), holding("2.0", "0 to 1")),
+        (lambda: Param(0.5, "1", 1.0, 0.0), holding("1.0", "0.0")),
+        (lambda: Param(0.5, std=0.0), None),
+        *(
+            (lambda bad=bad: replace(REWARD, input=np.array([bad])), holding("[reward] input"))
+            for bad in (-1.0, np.nan, np.inf)
+        ),
+    ],
+)
+def test_parameters_and_weights_are_numbers_within_their_bounds(make, match):
+    with pytest.raises(GroundedError, match=match):
+        make()
 
 
-def test_a_parameter_lies_between_its_bounds():
-    with pytest.raises(GroundedError, match=holding("2.0", "0 to 1")):
-        Param(2.0, "1", 0.0, 1.0)
-    with pytest.raises(GroundedError, match=holding("1.0", "0.0")):
-        Param(0.5, "1", 1.0, 0.0)
-    with pytest.raises(GroundedError):
-        Param(0.5, std=0.0)
+def test_a_parameter_says_where_it_stops_and_how_far_it_reaches():
     two = Param(0.5, "1", 0.0, 1.0)
     assert two.at_bound(0.0) and two.at_bound(1.0) and not two.at_bound(0.999)
     assert not Param(0.5, std=0.1).at_bound(0.5) and not Param(0.5).at_bound(0.5)
@@ -421,21 +421,18 @@ def test_short_gaps_are_straight_lines():
     assert found.longest_s == pytest.approx(0.5) and found.at_s == pytest.approx(1.5)
 
 
-@pytest.mark.parametrize(("length", "whole"), [(20, True), (21, False)])
-def test_a_gap_of_a_second_is_the_longest(length, whole):
-    found = interpolate_gaps(gappy([(10, 10 + length, 0)]))
-    assert np.isfinite(found.trial.states).all() == whole
-    assert found.trial.finite_steps == (60 if whole else 9)
-
-
-def test_a_gap_that_reaches_the_end_stays():
-    found = interpolate_gaps(gappy([(56, 61, 1)]))
-    assert found.samples == 0 and found.trial.finite_steps == 55
-
-
-def test_the_first_state_must_be_known():
-    found = interpolate_gaps(gappy([(0, 2, 0), (10, 12, 1)]))
-    assert found.samples == 0 and found.trial.finite_steps == -1
+@pytest.mark.parametrize(
+    ("gaps", "filled", "steps"),
+    [
+        ([(10, 30, 0)], 20, 60),  # a second
+        ([(10, 31, 0)], 0, 9),  # longer
+        ([(56, 61, 1)], 0, 55),  # to the end
+        ([(0, 2, 0), (10, 12, 1)], 0, -1),  # the first state must be known
+    ],
+)
+def test_gaps_of_up_to_a_second_between_known_states_are_filled(gaps, filled, steps):
+    found = interpolate_gaps(gappy(gaps))
+    assert (found.samples, found.trial.finite_steps) == (filled, steps)
 
 
 def test_inputs_are_never_invented():
@@ -453,12 +450,6 @@ def many(*steps):
     ]
 
 
-def test_all_trials_within_the_budget_are_used_as_they_are():
-    given = many(10, 20)
-    found = share_of(given, 30)
-    assert found.trials == given and found.finding is None
-
-
 @pytest.mark.parametrize("steps", [[10] * 1000, [1000], [5, 400, 5, 5], [90, 90, 90]])
 def test_a_share_stays_within_the_budget_and_says_which_it_is(steps):
     found = share_of(many(*steps), 100)
@@ -473,5 +464,8 @@ def test_whole_trials_are_taken_at_equal_distances():
     assert all(trial.steps == 10 for trial in found.trials)
 
 
-def test_a_share_has_no_more_trials_than_are_asked_for():
+def test_a_share_is_all_that_fits_or_as_many_trials_as_are_asked_for():
+    given = many(10, 20)
+    found = share_of(given, 30)
+    assert found.trials == given and found.finding is None
     assert len(share_of(many(*[2] * 50), 1000, 10).trials) == 10
