@@ -14,7 +14,6 @@ from grounded.model import Model, Param
 from grounded.models import aircraft, car, pendulum
 from grounded.search.first_guess import first_guess
 from grounded.solve import ddp
-from problems import system
 from small_tasks import plain_task
 from stepped import slopes
 
@@ -174,17 +173,6 @@ def test_what_is_infinitely_steep_at_rest_has_a_slope_there(eps):
     np.testing.assert_array_equal(f_p[0], 0.0)
     away = made.linearise(np.array([[3.0, 4.0]]), u, p, 0.1, eps)[0][0]
     assert away[0, 1] == pytest.approx(-0.1 * (3 * 0.8 + 0.8))
-
-
-def test_smoothing_narrows_to_the_exact_branch():
-    made, p = system("car")
-    x = np.array([[0.1, 0.5, 0.0, 0.0, 0.2]])
-    u = np.array([[0.3, 0.6]])
-    exact = made.step(x, u, p, 0.05, 0.0)
-    errors = [
-        np.abs(made.step(x, u, p, 0.05, eps) - exact).max() for eps in (0.1, 0.01, 1e-3, 1e-5)
-    ]
-    assert errors[0] > errors[1] > errors[-1] and errors[-1] < 1e-5
 
 
 def test_what_depends_on_parameters_alone_is_never_smoothed():
