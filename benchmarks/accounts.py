@@ -1,14 +1,16 @@
 """Put faults into logs of robots, and see which story is told of how each log came about.
 
     python -m benchmarks.accounts [--seeds 0,1,2] [--robots car,arm] [--faults NAME,...] [--all]
-                                  [--honest 20] [--wrong 300] [--by-hand 32]
+                                  [--honest 20] [--wrong 300] [--by-hand 32] [--ingest N]
 
 Five robots (car, arm, drone, boat, rover) are simulated with other parameters than their crude
 model's, by seed mostly with an effect that it lacks, and with noise. Each fault is put into the log
 of two runs, or of one of them, and `sound_trials` judges both. Printed are each true fault with
 what was named (right: the kind and the signals; part: the kind, with other signals, or tied with
 another story; silent: nothing; wrong: another kind), and how many honest runs were refused. With
-`--all` every case has a line. Seeds are even for building, odd for measuring.
+`--all` every case has a line. Seeds are even for building, odd for measuring. With `--ingest` N
+tables of each robot go through `ingest` instead, in which a run begins somewhere: whose it is said
+to be, and whether it is cut where it begins.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -26,10 +30,14 @@ import numpy as np
 from benchmarks.helpers import table
 from grounded import Model, Param, Reward, Search, Task
 from grounded.compile import Named
+from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.onboard import Runner
 from grounded.search.candidate import Candidate
 from grounded.trial import Trial
+from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.intake.opening.foreign import read_log_file
+from grounded_trials.workspace.intake.recognise import recognised
 
 DEGREES, RPM = 180 / np.pi, 30 / np.pi
 
@@ -267,6 +275,22 @@ class Real:
             alike: whether the log has the noise of these samples.
             named: further fields of the trial.
         """
+        fine, sent, noise = self.driven(asked, H, rng, fed=fed, age=age)
+        own = self.noise * rng.normal(size=(H + 1, fine.shape[1]))
+        logged = fine[::5] + (np.vstack([noise, own[-1:]]) if alike else own)
+        names = (self.robot.model.state_names, self.robot.model.input_names)
+        return Trial(logged, sent, self.robot.dt, *names, **named)
+
+    def driven(
+        self,
+        asked: Callable[[int, Array], Array],
+        H: int,
+        rng: np.random.Generator,
+        *,
+        fed: bool,
+        age: int,
+    ) -> tuple[Array, Array, Array]:
+        """Return the states at every fifth of a step, the commands, and the noise acted on."""
         robot, n = self.robot, self.robot.model.n
         fine, inputs, noise = [np.array(robot.start, float)], list[Array](), list[Array]()
         for k in range(H):
@@ -275,10 +299,7 @@ class Real:
             for _ in range(5):
                 a = inputs[max(k - self.late, 0)]
                 fine.append(_step(robot, fine[-1], a, self.values, self.size, robot.dt / 5))
-        own = self.noise * rng.normal(size=(H + 1, n))
-        logged = np.array(fine[::5]) + (np.vstack([noise, own[-1:]]) if alike else own)
-        names = (robot.model.state_names, robot.model.input_names)
-        return Trial(logged, np.array(inputs), robot.dt, *names, **named)
+        return np.array(fine), np.array(inputs), np.array(noise)
 
 
 def driven(robot: Robot, rng: np.random.Generator, count: int = 2) -> list[Trial]:
@@ -613,6 +634,95 @@ def runs(
         yield "by hand", told(trial)
 
 
+# --- logs of runs, through `ingest` --------------------------------------------------------------
+
+
+def ingested(which: str, seed: int, count: int) -> Iterator[tuple[str, str]]:
+    """Yield the kind of a table in which a run begins somewhere, and what `ingest` says of it.
+
+    Its rows are fifths of a step, each with a noise of its own. The program acted on rows of some
+    age, and the robot waited before.
+    """
+    robot, rng = ROBOTS[which](), np.random.default_rng([seed, 33, [*ROBOTS].index(which)])
+    task, real = task_of(robot, rng), Real.drawn(robot, rng)
+    search = Search(task)
+    for _ in range(TRIALS):
+        if (one := search.ask()) is None:
+            break
+        search.tell(run_of(real, one, rng, one.id))
+    with TemporaryDirectory() as name:
+        here = workspace_of(Path(name), which, task)
+        some = [here.save_candidate(one) for one in search.candidates]
+        for k in range(count):
+            kind = ("own", "own", "own", "another", "by hand")[k % 5]
+            own = some[int(rng.integers(0, len(some)))]
+            far = [one for one in some if one.id != own.id and _apart(one, own) > CLOSE]
+            if kind == "another" and not far:
+                continue
+            ran = far[int(rng.integers(0, len(far)))] if kind == "another" else own
+            begun = log_of(
+                Path(name) / "log.csv", real, task, None if kind == "by hand" else ran, rng
+            )
+            try:
+                read = read_log_file(here.forget(), Path(name) / "log.csv", own.id, False)
+                read = recognised(here, Path(name) / "log.csv", read, None)
+            except GroundedError as error:
+                said = error.finding.facts.get("other") if error.finding else ""
+                yield kind, "named" if said == ran.id else "another" if said else "refused"
+            else:
+                off = abs(1e-9 * read.cut.start_ns - begun) if read.cut else 0.0
+                yield kind, "taken" if off < 0.3 * robot.dt else "misplaced"
+
+
+def workspace_of(place: Path, which: str, task: Task) -> Folder:
+    """Return a workspace of a task, which reads tables."""
+    model = task.model
+    rows = np.column_stack([task.dt * np.arange(task.horizon + 1), task.target])
+    np.savetxt(
+        place / "target.csv", rows, "%.9g", ",", header=f"t,{','.join(model.states)}", comments=""
+    )
+    given = f'from benchmarks.accounts import ROBOTS\n\nmodel = ROBOTS["{which}"]().model\n'
+    (place / "model.py").write_text(given)
+    ends = zip(model.inputs, task.low, task.high, strict=True)
+    limits = "".join(f"{name} = [{low!r}, {high!r}]\n" for name, low, high in ends)
+    weights = ", ".join(f"{name} = 1.0" for name in model.states)
+    start = zip((*model.states, *model.inputs), (*task.start, *task.past), strict=True)
+    begins = ", ".join(f"{name} = {value!r}" for name, value in start)
+    signals = [("state", one) for one in model.states] + [("input", one) for one in model.inputs]
+    log = "".join(f'[log.{kind}.{name}]\npath = "/csv.{name}"\n' for kind, name in signals)
+    (place / "grounded.toml").write_text(
+        f'[model]\nfile = "model.py"\n[task]\ndt = {task.dt}\nhorizon = {task.horizon}\n'
+        f'target = "target.csv"\nstart = {{ {begins} }}\n[reward]\nstate = {{ {weights} }}\n'
+        f"[limits]\n{limits}{log}".replace("np.float64(", "").replace(")", "")
+    )
+    return Folder(place)
+
+
+def log_of(
+    path: Path, real: Real, task: Task, ran: Candidate | None, rng: np.random.Generator
+) -> float:
+    """Write the table of a candidate's run, or of one by hand; return when it began [s]."""
+    robot, H, wait = real.robot, task.horizon, int(rng.integers(10, 60))
+    wanted, hold = _excited(robot, rng, H), robot.held or (lambda x, want: want)
+    act = Runner(ran.policy).action if ran else None
+    age, size = int(rng.integers(0, 8)), real.noise
+    fine, sent, noise = real.driven(
+        lambda k, x: act(k * robot.dt, x) if act else hold(x, wanted[k]), H, rng, fed=True, age=age
+    )
+    states = np.vstack([np.repeat(fine[:1], wait, axis=0), fine])
+    states = states + size * rng.normal(size=states.shape)
+    for k in range(len(noise)):  # the rows that the program acted on
+        states[wait + max(5 * k - age, 0)] = fine[max(5 * k - age, 0)] + noise[k]
+    after = np.repeat(sent[-1:] if robot.held else 0 * sent[-1:], 1, axis=0)
+    inputs = np.vstack(
+        [np.repeat(task.past[None], wait, axis=0), np.repeat(sent, 5, axis=0), after]
+    )
+    t = 100 + robot.dt / 5 * np.arange(len(states))
+    names = ",".join(("t", *robot.model.state_names, *robot.model.input_names))
+    np.savetxt(path, np.column_stack([t, states, inputs]), "%.9g", ",", header=names, comments="")
+    return float(t[wait])
+
+
 def _apart(a: Candidate, b: Candidate) -> float:
     """Return the rms difference of two plans' commands, relative to their size."""
     u, v = a.predicted_inputs, b.predicted_inputs
@@ -683,10 +793,24 @@ def main() -> None:
     parser.add_argument("--honest", type=int, default=20, help="honest runs of each robot")
     parser.add_argument("--wrong", type=int, default=300, help="runs of another candidate, in all")
     parser.add_argument("--by-hand", type=int, default=32, help="runs by hand, in all")
+    parser.add_argument("--ingest", type=int, default=0, help="tables of each robot and seed")
     parser.add_argument("--all", action="store_true")
     args = parser.parse_args()
     seeds, robots = [int(s) for s in args.seeds.split(",")], args.robots.split(",")
     each, said = [(which, seed) for which in robots for seed in seeds], print if args.all else _no
+
+    if args.ingest:
+        logs, began = Counts(Counter), time.process_time()
+        for which, seed in each:
+            for kind, told in ingested(which, seed, args.ingest):
+                logs[kind][told] += 1
+                said(f"{told:8}{which:6}{seed:3} {kind}")
+        rows = [
+            (k, *(row[n] for n in ("taken", "misplaced", *RUNS[1:]))) for k, row in logs.items()
+        ]
+        print(table(("table", "taken", "misplaced", *RUNS[1:]), rows))
+        spent = (time.process_time() - began) / sum(map(Counter.total, logs.values()))
+        return print(f"{spent:.2f} s CPU each, with the searches")
 
     # every fault, as it was named
     counts, names, began = Counts(Counter), Counts(Counter), time.process_time()

@@ -56,13 +56,7 @@ SMOOTH_S = 0.3  # [s] half the window over which a path is smoothed
 
 
 class Ages:
-    """Trials whose sensors are put in time step by step, one finding after the other.
-
-    Args:
-        model: however crude.
-        trials: in the model's units.
-        shown: indices of the states with a sensor.
-    """
+    """Trials whose sensors are put in time step by step, one finding after the other."""
 
     def __init__(self, model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
         self.model, self.trials, self.shown = model, list(trials), list(shown)
@@ -70,11 +64,7 @@ class Ages:
         self.dt, self.names = self.trials[0].dt, model.state_names
 
     def findings(self, one_message: Sequence[str]) -> list[Finding]:
-        """Correct the trials; return what was found.
-
-        Args:
-            one_message: states that are logged in one message: all of them are late, or none.
-        """
+        """Correct the trials; of states in one message all are late, or none."""
         some = (self.pairs, self.positions)
         return [one for each in some for one in self.with_message(list(each()), one_message)]
 
@@ -166,13 +156,9 @@ class Ages:
             yield Finding(q, found_("sensor.late", q, by=_size(d, lag), of=w), "delay", d, lag.std)
 
     def in_time(self, i: int, lag: Lag, of: str, *, rate: bool = False) -> Finding:
-        """Undo the delay of state i. A filtered state is only reported: a shift can't restore it.
+        """Undo the delay of state i behind another, or (rate) behind its derivative.
 
-        Args:
-            i: the state.
-            lag: its delay, of either sign.
-            of: what it lags behind.
-            rate: whether it lags behind the derivative of that.
+        A filtered state is only reported: a shift can't restore it.
         """
         d, name = float(abs(lag.delay)), self.names[i]
         follows: dict[str, Any] = {"of": of, "derivative": rate}
@@ -276,16 +262,8 @@ def derived(
     """Return how a velocity follows from its position through a causal filter.
 
     That is the sum of the weights of the position's differences, its standard deviation, and their
-    mean age [s].
-
-    Args:
-        model: with this relation.
-        relation: the position and the velocity.
-        trials: of this model's states.
-        least: time over which it must certainly average [s].
-
-    Returns:
-        None if it has another scale, is not explained by the position's past, or averages less.
+    mean age [s]. None if it has another scale, is not explained by the position's past, or surely
+    averages over less than `least` [s].
     """
     dt, logs, length = trials[0].dt, list(_rates(model, relation, trials)), PAST + LATER
     ways = [np.concatenate([[0.0], np.cumsum(moved)])[:, None] for _, moved, _ in logs]
@@ -352,11 +330,6 @@ def late_positions(model: Model, trials: Sequence[Trial], both: Sequence[Row]) -
     path as well, a side slip or a tracked point ahead across it, a drift by a constant: beside
     these, none may remain of the delay. If the sideways velocity is not measured, it must show both
     along and across the path.
-
-    Args:
-        model: however crude.
-        trials: of one time step, already corrected for other faults.
-        both: the rows of the two positions.
     """
     dt, columns, units = trials[0].dt, [row.i for row in both], list(model.states.values())
     ways = [(z[:, columns], s[:, columns]) for t in trials for z, s in per_step(model, t, both)]
@@ -375,13 +348,8 @@ def _left(
 ) -> list[tuple[float, float]]:
     """Return the delay [s] that remains after shifting positions, with its standard deviation.
 
-    The plane is one of complex numbers here.
-
-    Args:
-        ways: displacements of each piece, measured and by the other sensors (T, 2).
-        steps: by which the positions are shifted earlier.
-        dt: time step [s].
-        apart: estimate the delay along the path and across it separately.
+    Along the path and across it if these are `apart`. Ways are the displacements of each piece,
+    measured and by the other sensors (T, 2); the plane is one of complex numbers here.
     """
     h, rows = max(3, round(SMOOTH_S / dt)), list[Array]()
     window = np.hanning(2 * h + 3)[1:-1]

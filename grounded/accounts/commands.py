@@ -41,16 +41,7 @@ STARTS = 120  # samples to predict from
 
 
 def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
-    """Raise an error if states respond to commands before they are sent, in half of the trials.
-
-    Args:
-        model: however crude.
-        trials: of its states and inputs.
-        shown: indices of the states with a sensor.
-
-    Raises:
-        UnusableTrials: naming the state, the seconds and the correction.
-    """
+    """Raise an error if states respond to commands before they are sent, in half of the trials."""
     each = {k: clocks_apart(model, one, shown) for k, one in enumerate(trials)}
     some = {k: told for k, told in each.items() if told}
     if some and 2 * len(some) >= len(each):  # one of many is a swing that sticks
@@ -58,13 +49,7 @@ def judge_clocks(model: Model, trials: Sequence[Trial], shown: Sequence[int]) ->
 
 
 def clocks_apart(model: Model, trial: Trial, shown: Sequence[int]) -> Finding | None:
-    """Return by how much the states of a trial lead its commands; None if they do not.
-
-    Args:
-        model: however crude.
-        trial: of its states and inputs.
-        shown: indices of the states with a sensor.
-    """
+    """Return by how much the states of a trial lead its commands; None if they do not."""
     trial = trial.until(trial.known_steps)
     reach = min(round(REACH_S / trial.dt), trial.steps // 4)
     least, near = max(2, round(EARLY_S / trial.dt)), max(1, round(GRID_S / trial.dt))
@@ -122,28 +107,17 @@ def _with_differences(model: Model, trial: Trial, known: list[int]) -> tuple[Tri
 
 @dataclass(frozen=True)
 class Acts:
-    """How an input acts in a trial.
+    """How an input acts in a trial."""
 
-    Args:
-        sign: 1 as in the model, -1 the other way round, 0 if the trial does not show it.
-        share: its effect as a share of the modelled one, below 0 the other way round.
-    """
-
-    sign: int
-    share: float
+    sign: int  # 1 as in the model, -1 the other way round, 0 if the trial does not show it
+    share: float  # its effect as a share of the modelled one, below 0 the other way round
 
 
 UNKNOWN = Acts(0, float("nan"))
 
 
 def how_inputs_act(model: Model, trial: Trial, shown: Sequence[int]) -> tuple[Acts, ...]:
-    """Return how each input acts in a trial.
-
-    Args:
-        model: however crude, with the effects adopted.
-        trial: of its states and inputs; only its part without gaps is used.
-        shown: indices of the states with a sensor.
-    """
+    """Return how each input acts in the part of a trial without gaps."""
     known = trial.until(max(trial.known_steps, 0))
     some = known_states(known, shown)
     if not some or not np.isfinite(known.inputs).all():
@@ -226,16 +200,7 @@ def _acts(each: Sequence[tuple[Array, float]]) -> Acts:
 
 
 def judge_signs(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> None:
-    """Raise an error if an input acts the other way round in some trials than in others.
-
-    Args:
-        model: however crude, with the effects adopted.
-        trials: already corrected for other faults.
-        shown: indices of the states with a sensor.
-
-    Raises:
-        UnusableTrials: naming the trials and the input, and what to do.
-    """
+    """Raise an error if an input acts the other way round in some trials than in others."""
     if len(trials) < 2:
         return
     acts = [how_inputs_act(model, trial, shown) for trial in trials]

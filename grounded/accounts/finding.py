@@ -22,33 +22,23 @@ SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
 class Finding(Document):
     """A fault of one signal, and whether the trials were corrected for it.
 
-    Args:
-        signal: a state or an input, or several joined by "+".
-        said: what is wrong with it, as an entry of the catalogue.
-        kind: delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
-            mismatch (with others), unresolved (too fast for the model's time step) or time step (of
-            the integrator, which is too long for the model).
-        delay_s: delay of the signal [s].
-        std_s: standard deviation of the delay [s].
-        scale: measured value over true value.
-        share: share of the samples affected, 0 to 1.
-        corrected: whether the trials were corrected before the physics was identified.
-        keys: keys of the signal's [log] table that correct the logs as well.
-        mend: the finding whose remedy says what to change, where no key of [log] corrects it.
-        source: the position from which a velocity was computed.
+    Kinds are delay, lag, smoothed, scale, sign, degrees, wrapped, offset, stuck, held, dropout,
+    mismatch (with others), unresolved (too fast for the model's time step) and time step (of the
+    integrator, which is too long for the model).
     """
 
-    signal: str
-    said: told.Finding | None = field(default=None, metadata={"brief": True})
+    signal: str  # a state or an input, or several joined by "+"
+    said: told.Finding | None = field(default=None, metadata={"brief": True})  # what is wrong
     kind: str = ""
     delay_s: float = 0.0
-    std_s: float = field(default=float("nan"), metadata={"brief": True})
-    scale: float = 1.0
-    share: float = field(default=float("nan"), metadata={"brief": True})
-    corrected: bool = False
-    keys: Mapping[str, Any] = field(default_factory=dict)
+    std_s: float = field(default=float("nan"), metadata={"brief": True})  # of the delay [s]
+    scale: float = 1.0  # measured value over true value
+    share: float = field(default=float("nan"), metadata={"brief": True})  # of samples affected
+    corrected: bool = False  # before the physics was identified
+    keys: Mapping[str, Any] = field(default_factory=dict)  # of [log] that correct logs as well
+    # its remedy says what to change, where no key of [log] corrects it
     mend: told.Finding | None = field(default=None, metadata={"brief": True})
-    source: str = field(default="", metadata={"brief": True})
+    source: str = field(default="", metadata={"brief": True})  # position of a computed velocity
 
     @property
     def finding(self) -> str:
@@ -101,12 +91,8 @@ def late_as_positions(
     """Yield a finding for each velocity that is computed from a position whose sensor is late.
 
     It is late by as much, too: what the sensors show of it is only how far behind its position it
-    is.
-
-    Args:
-        findings: those of all sensors.
-        delays: delays of sensors that the physics shows [s], by effect: `sensor_delay:x`.
-        known: names of effects that the model has already.
+    is. Delays that the physics shows [s] are by effect, `sensor_delay:x`; `known` are those that
+    the model has already.
     """
     for one in findings:
         late = {

@@ -39,17 +39,11 @@ NOISE_ALONE = 1.3  # times its white noise: the standard deviation of a dead sen
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is told of trials.
+    """What is told of trials."""
 
-    Args:
-        told: accounts in the order in which they were found.
-        corrected: the trials as they would be without what is certain.
-        open: the rows that no account explains, with their gaps over all trials.
-    """
-
-    told: tuple[Told, ...]
-    corrected: tuple[Trial, ...]
-    open: Mapping[Row, Gap]
+    told: tuple[Told, ...]  # in the order in which they were found
+    corrected: tuple[Trial, ...]  # as they would be without what is certain
+    open: Mapping[Row, Gap]  # rows that no account explains, with their gaps over all trials
 
 
 def judge(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> Verdict:
@@ -82,14 +76,7 @@ def _without(told: Told, trials: Sequence[Trial]) -> list[Trial]:
 
 
 def contradicted(model: Model, trial: Trial, shown: Sequence[int], account: Account) -> bool:
-    """Check whether the model predicts a trial clearly better as logged than without a fault.
-
-    Args:
-        model: however crude.
-        trial: of its states and inputs.
-        shown: indices of the states with a sensor.
-        account: the fault, of another trial.
-    """
+    """Check whether the model predicts a trial clearly better as logged than without a fault."""
     known, ones = known_states(trial, shown), np.ones(model.m)
     with np.errstate(all="ignore"):  # a command at its limit may make a constant rate
         logged, mended = (
@@ -116,14 +103,7 @@ def _pooled(every: Sequence[Mapping[Row, Gap]]) -> dict[Row, Gap]:
 
 
 class _ByRows:
-    """What kinematic rows tell of trials.
-
-    Args:
-        model: however crude.
-        trials: of its states and inputs.
-        rows: the kinematic rows.
-        shown: indices of the states with a sensor.
-    """
+    """What kinematic rows tell of trials."""
 
     def __init__(
         self, model: Model, trials: Sequence[Trial], rows: Sequence[Row], shown: Sequence[int]
@@ -317,14 +297,7 @@ def _examined(trials: Sequence[Trial], shown: Sequence[int]) -> list[int]:
 
 
 class _Seen:
-    """A trial as it would be by one account or another, and what the model misses of each.
-
-    Args:
-        model: however crude.
-        trial: of its states and inputs.
-        rows: the kinematic rows.
-        shown: indices of the states with a sensor.
-    """
+    """A trial as it would be by one account or another, and what the model misses of each."""
 
     def __init__(
         self, model: Model, trial: Trial, rows: Sequence[Row], shown: Sequence[int]

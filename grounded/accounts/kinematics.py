@@ -47,30 +47,17 @@ class Row:
 
 
 class Gap(NamedTuple):
-    """The difference between a row's prediction and its own sensor.
+    """The difference between a row's prediction and its own sensor."""
 
-    Attributes:
-        share: rms of the difference, relative to how far the state (or others of its unit) moves.
-        varying: the same without a constant difference.
-        rate: rms of the difference per time [unit/s].
-        ratio: measured displacement over the predicted one, by regression beside a drift.
-        power: variance of the predicted displacement, which weighs the ratio.
-    """
-
-    share: float
-    varying: float
-    rate: float
-    ratio: float
-    power: float
+    share: float  # rms, relative to how far the state (or others of its unit) moves
+    varying: float  # the same without a constant difference
+    rate: float  # rms of the difference per time [unit/s]
+    ratio: float  # measured displacement over the predicted one, by regression beside a drift
+    power: float  # variance of the predicted displacement, which weighs the ratio
 
 
 def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
-    """Return the kinematic rows of a model whose states all have sensors.
-
-    Args:
-        model: any; a simulator that can't take a short step has no such rows.
-        shown: indices of the states with a sensor.
-    """
+    """Return a model's rows of measured states; none of a simulator without short steps."""
     model, found = places.direct(model), list[Row]()
     dt = places.probe(model, INSTANT_S)
     if dt > INSTANT_S:
@@ -107,12 +94,7 @@ def kinematic_rows(model: Model, shown: Sequence[int]) -> list[Row]:
 def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
     """Return the gap of each row, over the stretch length at which it agrees best.
 
-    What white noise of its sensor explains is no gap.
-
-    Args:
-        model: with these rows.
-        trial: with this model's states.
-        rows: of the model; those hidden by noise are missing from the result.
+    What white noise of its sensor explains is no gap; a row that it hides has none.
     """
     known = [row for row in rows if np.isfinite(trial.states[:, [*row.states]]).any(axis=0).all()]
     units, found = list(model.states.values()), dict[Row, Gap]()
@@ -146,10 +128,7 @@ def gaps(model: Model, trial: Trial, rows: Sequence[Row]) -> dict[Row, Gap]:
 def _over(row: Row, ways: Sequence[Array], steps: int) -> tuple[Array, Array, float] | None:
     """Return displacements over so many steps, measured and by a row, and the former's noise.
 
-    Args:
-        row: if its size is fitted, these are what it says at the size that fits best.
-        ways: both from the begin of each piece on, (2, T - 1).
-        steps: of a stretch; None is returned if no piece holds enough of them.
+    Ways are both from the begin of each piece on, (2, T - 1). None if no piece holds enough steps.
     """
     usable = [way for way in ways if way.shape[1] > STEPS_TO_JUDGE * steps]
     if not usable:
@@ -162,15 +141,9 @@ def _over(row: Row, ways: Sequence[Array], steps: int) -> tuple[Array, Array, fl
 
 
 def per_step(model: Model, trial: Trial, rows: Sequence[Row]) -> list[tuple[Array, Array]]:
-    """Return for each piece the displacements per step: measured, and predicted by the rows.
+    """Return for each piece the displacements per step, measured and by the rows, (T - 1, n) each.
 
-    Args:
-        model: with these rows.
-        trial: with this model's states; a piece has no gaps in the states that the rows relate.
-        rows: of the model.
-
-    Returns:
-        Two arrays (T - 1, n) per piece; only the columns of the rows' states are meaningful.
+    A piece has no gaps in the states that the rows relate; only their columns are meaningful.
     """
     some, found = sorted({i for row in rows for i in row.states}), []
     for piece in pieces([trial], some) if rows else ():

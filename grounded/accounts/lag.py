@@ -27,29 +27,17 @@ WINDOWS = (1, 2, 4, 8, 16, 32, 64)  # half lengths of the smoothing window, samp
 
 @dataclass(frozen=True)
 class Lag:
-    """b lags a by `delay` seconds and is `sign * scale` times as large.
+    """b lags a by `delay` seconds and is `sign * scale` times as large."""
 
-    Args:
-        delay: [s], negative if b is early.
-        std: its standard deviation [s].
-        filtered: b follows a through a first-order filter with time constant `delay`.
-        sign: 1 or -1.
-        low: lower bound of the scale.
-        high: upper bound of the scale.
-        coherence: share of both signals that agrees, 0 to 1.
-        scale_std: standard deviation of the scale.
-        slow: the scale of slow motion, from the widest window with enough samples.
-    """
-
-    delay: float
-    std: float
-    filtered: bool
-    sign: int
-    low: float
-    high: float
-    coherence: float
+    delay: float  # [s], negative if b is early
+    std: float  # its standard deviation [s]
+    filtered: bool  # b follows a through a first-order filter with time constant `delay`
+    sign: int  # 1 or -1
+    low: float  # lower bound of the scale
+    high: float  # upper bound of the scale
+    coherence: float  # share of both signals that agrees, 0 to 1
     scale_std: float = np.inf
-    slow: float = np.nan
+    slow: float = np.nan  # the scale of slow motion, from the widest window with enough samples
 
     @property
     def scale(self) -> float:
@@ -73,14 +61,9 @@ class Lag:
 
 
 def lag_between(pairs: Pairs, dt: float) -> Lag | None:
-    """Estimate the delay of b behind a, and its scale.
+    """Estimate the delay of b behind a, and its scale; None if there is too little data.
 
-    Args:
-        pairs: pieces (a, b) without gaps, (T,) each, of the same length.
-        dt: sample time [s].
-
-    Returns:
-        None if there is too little data.
+    Pairs are pieces (a, b) without gaps, (T,) each.
     """
     longest = max((len(a) for a, _ in pairs), default=0)
     most = int(np.ceil(max(LARGEST_DELAY_S / dt, LARGEST_DELAY_STEPS)))

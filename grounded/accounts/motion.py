@@ -64,17 +64,11 @@ def known_states(trial: Trial, shown: Sequence[int]) -> list[int]:
 
 @dataclass(frozen=True)
 class Fit:
-    """The result of calibrating a model on one trial.
+    """The result of calibrating a model on one trial; 1 for states without a sensor."""
 
-    Args:
-        rms: rms error of each state (n,), in its unit; 1 for states without a sensor.
-        gains: gain of each input (m,).
-        moved: how far each state moves in that time (n,); 1 for states without a sensor.
-    """
-
-    rms: Array
-    gains: Array
-    moved: Array
+    rms: Array  # error of each state (n,), in its unit
+    gains: Array  # of each input (m,)
+    moved: Array  # how far each state moves in that time (n,)
 
     @property
     def score(self) -> float:
@@ -168,22 +162,14 @@ class Ahead:
         return self._fit(self.size(self._off(gains, self.model.values, 0)[0]), gains)
 
     def scores(self, gains: Array, late: Steps) -> Array:
-        """Return the errors of the uncalibrated model [nats] with commands some steps late, (K,).
-
-        Args:
-            gains: of the inputs (m,).
-            late: by how many steps they act late, (K,); below 0 early, at most by `early`.
-        """
+        """Return the errors of the uncalibrated model [nats] with commands (K,) steps late."""
         off = self._off(gains, self.model.values, late)
         return np.array([np.log(self.size(one)).sum() for one in off])
 
     def best(self, starts: Sequence[Array], *, free: bool = True, late: int | None = None) -> Fit:
-        """Return the best fit over several initial gains, each with its best delay.
+        """Return the best fit over several initial gains, which are fitted as well if `free`.
 
-        Args:
-            starts: initial gains (m,) each.
-            free: fit the gains as well as the parameters.
-            late: the delay [steps]; None: the one of `delays` that fits best.
+        Commands are `late` by some steps; None: by the one of `delays` that fits best.
         """
         each = np.array(self.delays if late is None else [late])
         fits = [

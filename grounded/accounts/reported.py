@@ -24,14 +24,7 @@ def tables(model: Model, names: Iterable[str]) -> tuple[str, ...]:
 
 
 def scaled(model: Model, names: Iterable[str], factor: float, unit: str = "") -> Finding:
-    """Return that columns are in another unit or of the other sign.
-
-    Args:
-        model: with the units.
-        names: of the columns.
-        factor: how many times too large they are; -1: of the other sign.
-        unit: in which they are, "" if unknown.
-    """
+    """Return that columns are too large by a factor, in this unit if it is known; -1: a sign."""
     names, units = tuple(names), {**model.states, **model.inputs}
     facts: dict[str, Any] = {"tables": tables(model, names), "by": 1 / factor}
     if factor == -1:
@@ -52,13 +45,7 @@ def scaled(model: Model, names: Iterable[str], factor: float, unit: str = "") ->
 
 
 def reported(model: Model, told: Told, column: int | None = None) -> list[Finding]:
-    """Return an account, and those that explain the trials as well.
-
-    Args:
-        model: with the names and units.
-        told: the account.
-        column: name only this one of several columns.
-    """
+    """Return an account, of one of its columns if it is named, and those that explain as much."""
     first = _reported(model, told, told.account, column)
     evidence: dict[str, Any] = {}
     if told.by_motion:

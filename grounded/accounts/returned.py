@@ -35,6 +35,8 @@ from grounded.accounts.levels import (
 from grounded.accounts.motion import SHORTLIST
 from grounded.accounts.reported import tables
 from grounded.accounts.sent import (
+    Commanded,
+    Fed,
     Following,
     Ran,
     apart,
@@ -43,6 +45,7 @@ from grounded.accounts.sent import (
     follows,
     latest,
     past_of,
+    size_of,
 )
 from grounded.accounts.table import Account, of_commands, unit_named
 from grounded.findings import Finding, Quantity, found
@@ -73,27 +76,16 @@ class Kind(Enum):
 
 @dataclass(frozen=True)
 class Story:
-    """One story of how the log of a candidate's run came about.
-
-    Args:
-        kind: what it is about.
-        finding: what it is, and what to do about it; None for columns times a factor.
-        commands: what it leaves of the commands [nats], the logarithm of their relative error.
-        motion: how far the robot is from its prediction then [nats].
-        price: what it costs before a log is seen [nats].
-        rerun: no setting reads this log: the next run, or another log of this one, is needed.
-        names: columns that have to be multiplied, or exchanged.
-        by: the factor.
-    """
+    """One story of how the log of a candidate's run came about."""
 
     kind: Kind
-    finding: Finding | None = None
-    commands: float = 0.0
-    motion: float = 0.0
-    price: float = 0.0
-    rerun: bool = False
-    names: tuple[str, ...] = ()
-    by: float = 1.0
+    finding: Finding | None = None  # None for columns times a factor
+    commands: float = 0.0  # what it leaves of them [nats], the logarithm of their relative error
+    motion: float = 0.0  # how far the robot is from its prediction then [nats]
+    price: float = 0.0  # before a log is seen [nats]
+    rerun: bool = False  # no setting reads this log: another run, or log of it, is needed
+    names: tuple[str, ...] = ()  # columns that have to be multiplied, or exchanged
+    by: float = 1.0  # the factor
 
     @property
     def left(self) -> float:
@@ -109,16 +101,7 @@ def scored(
     error: float,
     **other: Any,
 ) -> Story:
-    """Return a story with its score.
-
-    Args:
-        kind: what it is about.
-        finding: what to tell of it.
-        own: the candidate whose commands these are.
-        run: the trial as it was by the story.
-        error: what is left of the commands, relative to their size.
-        other: further fields of `Story`.
-    """
+    """Return a story with its score: a candidate's run, with what is left of the commands."""
     return Story(kind, finding, float(np.log(error + FINE)), apart(own, run), **other)
 
 
@@ -129,19 +112,12 @@ def likeliest(some: Iterable[Story | None], as_logged: Story) -> Story:
 
 
 class Row(NamedTuple):
-    """One entry of the table: what the policy was given, and what it was, before any score.
+    """One entry of the table: what the policy was given, and what it was, before any score."""
 
-    Attributes:
-        policy: as it acts.
-        run: the trial with its columns as the policy got them.
-        stories: that the log is so, or that the robot's program made it so; not scored yet.
-        steps: of the run that were before it began.
-    """
-
-    policy: Policy
-    run: Trial
-    stories: tuple[Story, ...]
-    steps: int = 0
+    policy: Policy  # as it acts
+    run: Trial  # with its columns as the policy got them
+    stories: tuple[Story, ...]  # that the log is so, or that the robot's program made it so
+    steps: int = 0  # of the run that were before it began
 
 
 def filtered(x: Array, shares: Array) -> Array:
@@ -178,31 +154,19 @@ def stories(
         return []
     trial = trial.until(min(trial.finite_steps, task.horizon, own.policy.horizon))
     logged = task.model.state_names if logged is None else logged
-    rows = nearest(_Table(task.model, own, trial, logged).rows(waits))
-    some = [one for row in rows for one in stories_of(row, task, own, trial, plain)]
-    return sorted(some, key=lambda one: one.left)
-
-
-def stories_of(row: Row, task: Task, own: Ran, trial: Trial, plain: Following) -> Iterator[Story]:
-    """Yield the stories of a row that explain a trial clearly better than as logged.
-
-    Args:
-        row: of the table.
-        task: the task of the candidate.
-        own: the candidate.
-        trial: the trial, not longer than its run.
-        plain: the comparison of its commands with the policy's.
-    """
-    fit = follows(row.policy, row.run, latest(task))
-    if fit is None or not fit.alike or fit.error > EXPLAINED:
-        return
-    plain = replace(plain, off=plain.off[: len(fit.off)])
-    motion, left = apart(own, trial, row.steps), fit.left
-    for story in row.stories:
-        there = motion if story.kind is Kind.PROGRAM else apart(own, row.run, row.steps)
-        gained = np.log((plain.left + FINE) / (left + FINE)) >= story.price + MARGIN
-        if gained and there <= motion:
-            yield replace(story, commands=float(np.log(left + FINE)), motion=there)
+    found = list[Story]()
+    for row in nearest(_Table(task.model, own, trial, logged).rows(waits)):
+        fit = follows(row.policy, row.run, latest(task))
+        if fit is None or not fit.alike or fit.error > EXPLAINED:
+            continue
+        before = replace(plain, off=plain.off[: len(fit.off)]).left
+        motion, gain = apart(own, trial, row.steps), np.log((before + FINE) / (fit.left + FINE))
+        for story in row.stories:
+            there = motion if story.kind is Kind.PROGRAM else apart(own, row.run, row.steps)
+            if gain >= story.price + MARGIN and there <= motion:
+                left = float(np.log(fit.left + FINE))
+                found.append(replace(story, commands=left, motion=there))
+    return sorted(found, key=lambda one: one.left)
 
 
 def nearest(rows: Sequence[Row]) -> list[Row]:
@@ -214,10 +178,9 @@ def nearest(rows: Sequence[Row]) -> list[Row]:
         policy, runs = rows[some[0]].policy, [rows[k].run for k in some]
         T, past = min(runs[0].steps, policy.horizon), past_of(policy, runs[0])
         sent = np.clip(np.stack([run.inputs[:T] for run in runs]), policy.low, policy.high)
-        states = np.stack([run.states[:T] for run in runs])
-        asked = policy.commands(states, past)
-        size = np.maximum(np.abs(asked).max(axis=1), np.abs(sent).max(axis=1)) + 1e-12
-        square = (((asked - sent) / size[:, None]) ** 2).mean(axis=2)
+        asked = policy.commands(np.stack([run.states[:T] for run in runs]), past)
+        size = np.stack([size_of(policy, one) for one in sent])[:, None]
+        square = Commanded(sent, asked, size).apart ** 2
         left = np.sqrt(np.median(square, axis=1) + 1e-3 * square.mean(axis=1))
         for k, error in zip(some, left, strict=True):
             score[k] = np.log(error + FINE) + min(one.price for one in rows[k].stories)
@@ -228,14 +191,7 @@ def nearest(rows: Sequence[Row]) -> list[Row]:
 
 
 class _Table:
-    """The rows of a trial: those that hold for any, and those with a number that is fitted.
-
-    Args:
-        model: of the task.
-        own: the candidate that it is said to have run.
-        trial: the trial, not longer than its run.
-        logged: the states that a column holds.
-    """
+    """The rows of a trial: those that hold for any, and those with a number that is fitted."""
 
     def __init__(self, model: Model, own: Ran, trial: Trial, logged: Sequence[str]) -> None:
         self.model, self.own, self.policy, self.trial = model, own, own.policy, trial
@@ -243,11 +199,7 @@ class _Table:
         self.fed = own.policy.gain is not None
 
     def rows(self, waits: bool | None) -> list[Row]:
-        """Return all rows.
-
-        Args:
-            waits: whether its log begins before any run; None if that is unknown.
-        """
+        """Return all rows."""
         scales = [*self.scales()]
         some = [*scales, *self.orders(), *self.times()]
         if self.fed:
@@ -333,11 +285,11 @@ class _Table:
         policy, trial, n, m = self.policy, self.trial, self.model.n, self.model.m
         free = replace(policy, low=np.full(m, -np.inf), high=np.full(m, np.inf))
         run = commanded(free, trial)
-        off, T = (run.sent - run.asked) / run.size, len(run.sent)
+        off, T = (run.sent - run.asked[0]) / run.size, len(run.sent)
         assert policy.gain is not None
         gains = policy.gain[:T, :, :n] / run.size[:, None]
         inside, asked = (
-            (u > policy.low) & (u < policy.high) for u in (run.sent, run.asked)
+            (u > policy.low) & (u < policy.high) for u in (run.sent, run.asked[0])
         )  # at its limits a command tells nothing
         log = [one for row in known for one in row.stories if one.kind is Kind.UNIT]
 
@@ -414,7 +366,7 @@ class _Table:
         for side, sign in enumerate((-1.0, 1.0)):
             most = (sign * run.sent).max(axis=0, initial=-np.inf)
             at = sign * run.sent >= most - FINE**2 * run.size
-            more = sign * run.asked > most + SLIGHT * run.size
+            more = sign * run.asked[0] > most + SLIGHT * run.size
             inside = most < sign * ends[side] - SLIGHT * run.size
             often = at.sum(axis=0) >= max(STEPS_TO_JUDGE, len(cut) / STEPS_TO_JUDGE / 2)
             often &= (at & more).sum(axis=0) > NEARLY_ALL * at.sum(axis=0)
@@ -469,7 +421,7 @@ class _Table:
 
         def left(k: int) -> float:
             run = commanded(policy.after(k), self.trial.until(min(most, policy.horizon - k)))
-            return float(np.median((((run.asked - run.sent) / run.size) ** 2).mean(axis=1)))
+            return float(np.median(run.apart))
 
         best = min(range(max(1, policy.horizon - STEPS_TO_JUDGE + 1)), key=left)
         if not best:
@@ -531,6 +483,7 @@ def suspicion(
     own: Ran,
     others: Sequence[Ran],
     logged: Sequence[str] | None = None,
+    given: Callable[[Ran], Iterable[tuple[Trial, Fed | None]]] | None = None,
 ) -> Suspicion:
     """Check whether a trial is a run of its candidate, and if not, whose it is.
 
@@ -540,17 +493,33 @@ def suspicion(
         own: the candidate that it is said to have run.
         others: candidates that it may have run instead, in order of proposal.
         logged: the states that a column holds; None: all.
+        given: runs if they are a candidate's, and what it may have been fed; None: the trial.
     """
-    trial, late = trial.until(task.horizon), latest(task)
-    ran = follows(own.policy, trial, late)
-    if ran is None or (ran.alike and ran.error < FINE):
+    trial = trial.until(task.horizon)
+
+    def compared(one: Ran) -> Following | None:
+        some = [
+            follows(one.policy, run.until(task.horizon), latest(task), fed)
+            for run, fed in (given(one) if given else [(trial, None)])
+        ]
+        return min(filter(None, some), key=lambda fit: fit.usual, default=None)
+
+    ran = compared(own)
+    if ran is None or ran.exact or (ran.alike and ran.error < FINE):
         return Suspicion(ran)
-    rivals = [(follows(c.policy, trial, late), c.id) for c in others[-OTHERS:] if c.id != own.id]
-    alike = [(f.error, n, evidence(ran.apart, f.apart)) for f, n in rivals if f and f.alike]
+    rivals = [(compared(one), one.id) for one in others[-OTHERS:] if one.id != own.id]
+    late = given is not None and ran.alike and ran.late  # late commands belong to other steps
+    alike = [
+        (fit, name, evidence(ran.apart, fit.apart))
+        for fit, name in rivals
+        if fit and (fit.exact or (fit.alike and not late))
+    ]
     if sure := [one for one in alike if one[2] > DECISIVE]:
-        left, name, nats = min(sure)
-        near = name if left < max(EXACT, HALF * ran.error) else ""
-        return Suspicion(ran, found("log.another", ran=own.id, other=name, nats=nats), near)
+        fit, name, nats = min(sure, key=lambda one: (one[0].error, one[1]))
+        near = name if fit.exact or fit.error < max(EXACT, HALF * ran.error) else ""
+        told = found("log.another", ran=own.id, other=name, nats=nats)
+        usual = [max(one.usual, FINE) if np.isfinite(one.usual) else None for one in (fit, ran)]
+        return Suspicion(ran, told.also(theirs=usual[0], mine=usual[1]), near)
     some = cache(partial(stories, task, own, trial, ran, logged=logged))
     if ran.alike:
         return Suspicion(ran, asked=some)

@@ -24,13 +24,7 @@ Gone = tuple[Sequence[Any], Mapping[str, Any]]  # samples that show nothing, and
 def judge_samples(
     model: Model, trials: Sequence[Trial], shown: Sequence[int]
 ) -> tuple[list[Finding], list[Trial]]:
-    """Check the samples of each sensor on its own; return the findings and the mended trials.
-
-    Args:
-        model: with the units.
-        trials: of its states, of one time step.
-        shown: indices of the states with a sensor.
-    """
+    """Check the samples of each sensor on its own; return the findings and the mended trials."""
     findings, mended = list[Finding](), [np.array(trial.states) for trial in trials]
     for i in shown:
         name, unit = list(model.states.items())[i]
@@ -42,7 +36,7 @@ def judge_samples(
             findings += [one] * (count > 0)
         for kind, look in (("dropout", _dropouts), ("held", _held), ("stuck", _stuck)):
             sizes = np.concatenate([np.abs(np.diff(x)) for x in columns])
-            sizes = sizes[np.isfinite(sizes) & (sizes > 0)]
+            sizes = sizes[np.isfinite(sizes) & (sizes > 0)]  # of all changes
             seen = look(columns, sizes, trials[0].dt) if len(sizes) >= FEWEST_SAMPLES else None
             if seen:
                 gone, facts = seen
@@ -80,13 +74,7 @@ def _jumps(x: Array, turn: float) -> Array:
 
 
 def _dropouts(columns: Columns, sizes: Array, dt: float) -> Gone | None:
-    """Find a fixed value that a signal jumps to for single samples.
-
-    Args:
-        columns: the samples.
-        sizes: of all changes from sample to sample, without zeros.
-        dt: time step [s].
-    """
+    """Find a fixed value that a signal jumps to for single samples."""
     far, values = 10 * float(np.quantile(sizes, NEARLY_ALL)), []
     for x in columns:
         there = (np.abs(x[1:-1] - x[:-2]) > far) & (np.abs(x[1:-1] - x[2:]) > far)

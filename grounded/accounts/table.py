@@ -55,29 +55,17 @@ ROWS, MOTION, COMMANDS = Term.ROWS, Term.MOTION, Term.COMMANDS
 
 @dataclass(frozen=True)
 class Account:
-    """One story of how a log came about.
+    """One story of how a log came about."""
 
-    Args:
-        kind: unit, sign, exchange, dead, offset, axes or pace (of the time stamps).
-        columns: those that are changed, or dead.
-        factor: how many times too large they are; -1: of the other sign.
-        offset: what is added to the first of them after that.
-        pairs: columns in each other's place.
-        unit: in which the columns are, or "".
-        price: what it costs before any log is seen [nats].
-        fitted: the heading whose offset is to be estimated.
-        terms: what can show it.
-    """
-
-    kind: str
-    columns: tuple[int, ...] = ()
-    factor: float = 1.0
-    offset: float = 0.0
-    pairs: tuple[tuple[int, int], ...] = ()
-    unit: str = ""
-    price: float = 0.0
-    fitted: bool = False
-    terms: Term = field(default=Term(0), compare=False)
+    kind: str  # unit, sign, exchange, dead, offset, axes or pace (of the time stamps)
+    columns: tuple[int, ...] = ()  # those that are changed, or dead
+    factor: float = 1.0  # how many times too large they are; -1: of the other sign
+    offset: float = 0.0  # what is added to the first of them after that
+    pairs: tuple[tuple[int, int], ...] = ()  # columns in each other's place
+    unit: str = ""  # in which the columns are
+    price: float = 0.0  # what it costs before any log is seen [nats]
+    fitted: bool = False  # the heading's offset is to be estimated
+    terms: Term = field(default=Term(0), compare=False)  # what can show it
 
     @property
     def touched(self) -> frozenset[int]:
@@ -108,25 +96,17 @@ class Account:
 
 @dataclass(frozen=True)
 class Told:
-    """An account of some trials, and what shows it.
-
-    Args:
-        account: the story.
-        trials: indices of the trials that it concerns.
-        gain: by how much less is unexplained [nats].
-        others: accounts that explain the trials as well.
-        whole: whether it concerns all trials.
-        by_motion: the state that the model predicts best with it, its rms error as logged and
-            mended, and how far ahead [s]; None if kinematics show it.
-        moved: of a dead velocity: its position, its mean and how far the position moves.
-    """
+    """An account of some trials, and what shows it."""
 
     account: Account
-    trials: tuple[int, ...]
-    gain: float
-    others: tuple[Account, ...] = ()
-    whole: bool = True
+    trials: tuple[int, ...]  # indices of those that it concerns
+    gain: float  # by how much less is unexplained [nats]
+    others: tuple[Account, ...] = ()  # that explain the trials as well
+    whole: bool = True  # it concerns all trials
+    # the state that the model predicts best with it, its rms error as logged and mended, and how
+    # far ahead [s]; None if kinematics show it
     by_motion: tuple[int, float, float, float] | None = None
+    # of a dead velocity: its position, its mean and how far the position moves
     moved: tuple[int, float, float] | None = None
 
     @property
@@ -148,9 +128,7 @@ class Told:
 def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
     """Return in which other units a signal may be, with the factor by which it is then too large.
 
-    Args:
-        unit: the model's unit.
-        most: the largest size in the log of a command that is a part of 1.
+    `most` is the largest size in the log of a command that is a part of 1.
     """
     if unit in UNITS:
         return UNITS[unit]
@@ -164,12 +142,7 @@ def units_of(unit: str, most: float = 0.0) -> dict[str, float]:
 
 
 def unit_named(units: Iterable[str], factor: float) -> str:
-    """Return in which unit signals are that are too large by a factor; "" if it has no name.
-
-    Args:
-        units: the model's, of each signal.
-        factor: how many times as large as in these.
-    """
+    """Return in which unit signals are that are too large by a factor; "" if it has no name."""
     names = set[str]()
     for unit in units:
         stem = unit.partition("/")[0]
@@ -285,8 +258,5 @@ def _units(
 
 
 def of_commands(model: Model, *inputs: Array) -> list[Account]:
-    """Return the units and signs of columns that the commands of a policy may show.
-
-    Kinematics can't: all that one wheel, one gyro or one encoder measures may be off together.
-    """
+    """Return the units and signs that commands may show: one wheel, or gyro, may be off whole."""
     return [one for one in accounts(model, inputs=inputs) if Term.COMMANDS in one.terms]

@@ -26,10 +26,7 @@ PARTS = (2, 4, 8, 16, 32, 64)
 def judge_time_step(model: Model, trials: Sequence[Trial], shown: Sequence[int]) -> list[Finding]:
     """Return the finding on the state that the model's steps miss most, if they are too long.
 
-    Args:
-        model: only one given by its derivative is integrated here.
-        trials: in the model's units.
-        shown: indices of the states with a sensor; the others are taken as 0.
+    Only a model given by its derivative is integrated here; states without a sensor are 0.
     """
     own, dt = np.isin(np.arange(model.n), shown), trials[0].dt
     x = np.concatenate([np.where(own, trial.states[:-1], 0.0) for trial in trials])
@@ -90,11 +87,6 @@ def judge_resolution(
 
     A policy that fails can whirl an arm up to speeds at which the integrator misses by more than
     the body moves in sound trials, and one such trial outweighs all others.
-
-    Args:
-        model: however crude; only one given by its derivative is integrated here.
-        trials: in the model's units.
-        shown: indices of the states with a sensor; the others are taken as 0.
     """
     if model.derivative is None or len(trials) < 2:
         return

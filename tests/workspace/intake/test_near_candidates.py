@@ -9,6 +9,7 @@ import pytest
 from grounded import Model
 from grounded.accounts.returned import suspicion
 from grounded.accounts.sent import evidence, follows
+from grounded.errors import GroundedError
 from grounded.policy import Policy
 from grounded.trial import Trial
 from grounded_trials.formats.mcap_writer import McapWriter
@@ -18,10 +19,9 @@ from grounded_trials.store.trial_file import write_trial
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.intake.ingest import ingest_log
-from grounded_trials.workspace.intake.look import sender_of
-from grounded_trials.workspace.intake.opening.foreign import mapping_of, read_foreign
-from grounded_trials.workspace.intake.opening.run_start import acted_on, recording
-from grounded_trials.workspace.intake.recognise import stories_of_log
+from grounded_trials.workspace.intake.opening.foreign import read_log_file
+from grounded_trials.workspace.intake.opening.run_start import recording
+from grounded_trials.workspace.intake.recognise import recognised, stories_of_log
 from recorded import follow
 from small_tasks import plain_task
 from workspaces import CONFIG, make
@@ -159,21 +159,12 @@ TOPICS = (("place", "x"), ("wheel", "v"), ("sent", "force"))
 def test_the_robot_ran_an_old_candidate_on_samples_of_its_own(ladder, tmp_path, ran, said, jitter):
     w, by_alpha = ladder
     log = drive(tmp_path / "a.mcap", w, by_alpha[ran], 1, jitter=jitter)
-    seen = sender_of_log(w, log, by_alpha[said])
-    assert seen.other == by_alpha[ran].id == seen.why.facts["other"]
-    assert seen.own.left > 2 * acted_on(*at_start(w, log, by_alpha[ran])).left
-
-
-def sender_of_log(w, path, said):
-    """Who sent a log's commands, of all candidates of the workspace."""
-    log, _, _ = at_start(w, path, said)
-    return sender_of(log, said, w.read().candidates, lambda one: log.start_of(one.policy))
-
-
-def at_start(w, path, made):
-    """A log, a candidate's policy, and where its run begins."""
-    log = read_foreign(w, path, mapping_of(w, path)).recording
-    return log, made.policy, log.start_of(made.policy).seconds
+    read = read_log_file(w, log, by_alpha[said].id, data=False)
+    with pytest.raises(GroundedError) as refused:
+        recognised(w, log, read, None)
+    told = refused.value.finding
+    assert told.code == "log.another" and told.facts["other"] == by_alpha[ran].id
+    assert told.facts["mine"] > 2 * told.facts["theirs"]
 
 
 DT, STEPS, WAITS, LIMIT, NAMES = 0.01, 300, 150, 7.4, (("tilt", "rate"), ("voltage",))
@@ -255,7 +246,7 @@ def test_a_run_at_its_limits_begins_where_its_few_other_commands_are_exact(seed=
     assert np.mean(np.abs(rows[WAITS : WAITS + STEPS, 3]) < LIMIT) < 0.05
     _, log = log_of(rows)
     found = log.start_of(ran.policy)
-    assert found.alike and found.exact
+    assert found.alike and found.ran.exact
     assert found.seconds == pytest.approx(WAITS * DT, abs=0.004)
 
 

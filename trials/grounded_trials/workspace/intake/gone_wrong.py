@@ -44,7 +44,6 @@ from grounded.search.standing import Standing
 from grounded.trial import Interpolated, Trial, interpolate_gaps
 from grounded_trials.workspace.candidates.search_state import standing_in, standing_of
 from grounded_trials.workspace.folder import Contents, Folder
-from grounded_trials.workspace.last_diagnosis import diagnosable
 
 SIGN_ASKED_FROM = 10.0  # times what runs miss otherwise: from here on an input's sign is asked
 START_IS_OFF = 3.0  # times sensor noise, and earlier starts' rms, by which a start must be off
@@ -74,7 +73,10 @@ class Run:
     @property
     def tried(self) -> Tried | None:
         """Its candidate with all of its runs; None if it ran none of the search."""
-        return next((t for t in self.history if t.candidate.id == self.trial.candidate), None)
+        for one in self.history:
+            if one.candidate.id == self.trial.candidate:
+                return one
+        return None
 
     @cached_property
     def bridged(self) -> Interpolated:
@@ -105,9 +107,7 @@ class Run:
     def shown(self, *, own: bool, doubted: bool = False) -> Iterator[Finding | None]:
         """Yield what it shows of its log, its program, its start and its motion.
 
-        Args:
-            own: it was written by grounded, and not read through [log].
-            doubted: its candidate was named against its commands.
+        `own` was written by grounded; `doubted` had its candidate named against its commands.
         """
         yield from self.log_faults(own=own)
         if self.trial.candidate and not (self.as_planned or doubted):
@@ -127,8 +127,8 @@ class Run:
     def ran_otherwise(self) -> Finding | None:
         """Return how a program ran its candidate otherwise than planned; None if it did not.
 
-        Commands that are some steps late in a log were sent late or logged late: commands and
-        states alone do not tell which.
+        Commands that are some steps late in a log, or on states some steps old, were sent late or
+        logged late: commands and states alone do not tell which.
         """
         from grounded.accounts.returned import Kind, stories  # of runs that are not as planned
 
@@ -137,10 +137,11 @@ class Run:
         some = stories(task, self.own, self.run, ran)
         if some and some[0].kind is Kind.PROGRAM:
             return some[0].finding
-        if ran is None or not (ran.alike and ran.late and ran.moved < HALF**2):
+        late = (ran.late or int(ran.age)) if ran else 0
+        if ran is None or not (ran.alike and late and ran.moved < HALF**2):
             return None
         # the states acted on show a wrong start
-        late, side = ran.late, "late" if ran.late > 0 else "early"
+        side = "late" if late > 0 else "early"
         start = late < 0 or ran.age <= HALF * late
         what = "start" if start else "either"
         return found("log.late", ran=self.own.id, steps=abs(late), side=side, what=what)
@@ -148,6 +149,10 @@ class Run:
     def gone_wrong(self) -> Finding | None:
         """Return that an input seems reversed in its motion."""
         tried, run, missed, usual = self.tried, self.whole, 0.0, 1.0
+        if self.as_planned:
+            return None
+        from grounded.search.run_motion import reversed_input
+
         every = [t for t in self.history if t.utilities and math.isfinite(t.utility)]
         others = [t for t in every if t is not tried]
         if tried:
@@ -157,13 +162,10 @@ class Run:
             cost = min(abs(t.utility) for t in others)
             off = np.array([abs(t.promised - t.utility) for t in others])
             usual = max(usual, cost, float(median(off)))
-        if not self.as_planned:
-            from grounded.search.run_motion import reversed_input
-
-            astray = missed > SIGN_ASKED_FROM * usual
-            if turned := reversed_input(self.workspace.planner, run, astray=astray):
-                return self._is_it_wired(turned)
-        return None
+        turned = reversed_input(
+            self.workspace.planner, run, astray=missed > SIGN_ASKED_FROM * usual
+        )
+        return self._is_it_wired(turned) if turned else None
 
     def _is_it_wired(self, turned: Finding) -> Finding:
         """Return that an input acted the other way round, given the other trials.
@@ -171,6 +173,7 @@ class Run:
         If it did so in all of them, the model has the wrong sign: no run is at fault.
         """
         from grounded.search.run_motion import signs_of
+        from grounded_trials.workspace.last_diagnosis import diagnosable
 
         each = [
             (one.id, signs_of(self.workspace.planner, one)[turned.about[0]])
@@ -197,7 +200,7 @@ class Run:
         noise = sample_noise(trial.until(len(states) - 1), own.predicted_states)
         noise = np.maximum(noise, 1e-9)
         order = np.argsort(-np.abs(off) / noise)
-        far = [int(i) for i in order if abs(off[i]) > START_IS_OFF * noise[i]]
+        far = order[np.abs(off)[order] > START_IS_OFF * noise[order]].tolist()
         if not far:
             return None
         # what the start costs, beside the scatter of single runs of about this cost
@@ -253,11 +256,7 @@ def placing(workspace: Folder, contents: Contents, but: str = "") -> tuple[Array
 
     A run that was discarded counts too, since the robot was placed before it. The rms is estimated
     by the median, so that a misread log is no usual start; it is 0 of fewer than `FEWEST` runs.
-
-    Args:
-        workspace: the workspace with the runs.
-        contents: what is stored in it.
-        but: id of a run that is left out, since it is judged by the others.
+    One of them may be left out (`but`), since it is judged by the others.
     """
     task, stored = workspace.task, (*workspace.trials(), *workspace.aside_trials())
     own = {made.id for made in contents.candidates}

@@ -26,12 +26,9 @@ from grounded_trials.workspace.readings import paths_of, read_by
 
 
 def log_faults(workspace: Folder, trial: Trial, *, own: bool = False) -> tuple[Finding, ...]:
-    """Return all faults found in the columns of a trial.
+    """Return all faults found in the columns of a trial, with gaps bridged, in its first steps.
 
-    Args:
-        workspace: the workspace with the model and [safety].
-        trial: the trial, with gaps bridged; of a long one its first steps are looked at.
-        own: it was written by grounded, and not read through [log].
+    `own` was written by grounded, and not read through [log].
     """
     trial = trial.until(STEPS)
     known = trial.until(trial.known_steps)
@@ -78,13 +75,8 @@ def not_the_logs(
 
     Which term needs it tells where it lies: the log, if both the commands of its candidate and the
     motion are right without it; the program, if the robot moved as logged; the robot, if the
-    program sent as logged. Other trials that [log] read in the same way may show none.
-
-    Args:
-        workspace: the workspace with the model and the trials.
-        trial: the trial, with gaps bridged.
-        fault: the sign or exchange.
-        commands: they need it; else the motion does.
+    program sent as logged. Other trials that [log] read in the same way may show none. Either the
+    `commands` need the fault, or the motion does.
     """
     model, known = workspace.base_model, trial.until(trial.known_steps)
     right = without(workspace, trial, fault)

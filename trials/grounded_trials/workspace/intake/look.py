@@ -1,4 +1,4 @@
-"""Whose run a log is by its commands, where it begins, and whether it fell.
+"""Where the run of a candidate begins in a log, and whether it fell.
 
 After a fall, or when its motors are cut, a robot's program sends other commands than the policy,
 mostly zeros, and the log contains them too. If the run had left [safety] by then, it counts as a
@@ -8,90 +8,23 @@ whole still resemble the candidate's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
-
 import numpy as np
 
-from grounded.accounts.levels import DECISIVE, EXACT, EXPLAINED, FINE, LATEST, SMALL, STEPS_TO_JUDGE
-from grounded.accounts.sent import (
-    Following,
-    evidence,
-    follows,
-)
+from grounded.accounts.levels import EXPLAINED, FINE, LATEST, STEPS_TO_JUDGE
+from grounded.accounts.sent import Following, follows
 from grounded.findings import Finding, Quantity, found
 from grounded.policy import Policy
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import LAST, Trial, interpolate_gaps
-from grounded_trials.workspace.intake.opening.run_start import ActedOn, Recording, Start, acted_on
+from grounded_trials.workspace.intake.opening.run_start import Recording, Start
 
 LOOSE = 0.1  # distance from the first command, in steps, above which it is another start
 ALIGNED = 0.75  # starts closer than this, in sample intervals, are considered equal
 CLEARLY = 0.7  # a start is elsewhere if its difference is below this share of the first command's
 
 
-class Sender(NamedTuple):
-    """The candidate that sent the commands of a log, judged on the samples that it acted on."""
-
-    own: ActedOn | None  # None if the log is too short
-    why: Finding | None = None  # why it was another candidate
-    other: str = ""  # that candidate
-
-    @property
-    def sure(self) -> bool:
-        """Whether the own candidate sent them throughout, mostly to the last digits."""
-        return self.own is not None and self.own.throughout
-
-
-def sender_of(
-    log: Recording,
-    own: Candidate,
-    candidates: Sequence[Candidate],
-    start_of: Callable[[Candidate], Start | None],
-) -> Sender:
-    """Check whether another candidate than the stated one sent the commands of a log.
-
-    A neighbour of it sends commands that differ by a few percent, so each is computed from the
-    samples of the age that fits best.
-    """
-
-    def alike(one: Candidate, at: float) -> int | None:
-        """Return by how many steps a candidate's commands are late, None if they are not alike."""
-        trial = log.trial_from(at)
-        ran = follows(one.policy, trial.until(one.policy.horizon), LATEST) if trial else None
-        return ran.late if ran is not None and ran.alike else None
-
-    start = start_of(own)
-    begins = log.first if start is None else start.seconds
-    mine = acted_on(log, own.policy, begins)
-    if mine is None or mine.exact:
-        return Sender(mine)
-    best, name, theirs = DECISIVE, "", mine
-    late = alike(own, begins)  # late commands belong to other steps
-    for one in reversed(candidates):
-        at = begins
-        if (start is None or not start.alike) and (begun := start_of(one)) and begun.opens_alike:
-            at = begun.seconds
-        fit = None if one.id == own.id else acted_on(log, one.policy, at)
-        if fit is None or fit.left > SMALL:
-            continue
-        T = min(len(mine.asked), len(fit.asked))
-        differ = np.sqrt((((mine.asked[:T] - fit.asked[:T]) / mine.size) ** 2).mean())
-        if differ < EXACT or (nats := evidence(mine.off, fit.off)) <= best:
-            continue
-        if fit.exact or (not late and alike(one, at) is not None):
-            best, name, theirs = nats, one.id, fit
-        if theirs.left < FINE:
-            break
-    if not name:
-        return Sender(mine)
-    told = found("log.another", ran=own.id, other=name, nats=best)
-    told = told.also(theirs=max(theirs.left, FINE), mine=max(mine.left, FINE))
-    return Sender(mine, told, name)
-
-
-def elsewhere(log: Recording, start: Start, policy: Policy, *, why: bool) -> bool:
+def elsewhere(log: Recording, start: Start, policy: Policy) -> bool:
     """Return whether a run begins at the start found rather than at the log's first command.
 
     The first command of a busy computer may be late. If the run began with it, all others would be
@@ -100,7 +33,11 @@ def elsewhere(log: Recording, start: Start, policy: Policy, *, why: bool) -> boo
     off = abs(start.seconds - log.first)
     if not start.opens_alike or off <= ALIGNED * log.interval:
         return start.alike and off > LOOSE * log.dt and not log.late.any()
-    return why or start.exact or start.apart < CLEARLY * log.apart_at(policy, log.first)
+    if start.ran.exact or start.apart < CLEARLY * log.apart_at(policy, log.first):
+        return True
+    first = log.trial_from(log.first)
+    ran = None if first is None else follows(policy, first.until(policy.horizon), LATEST)
+    return ran is not None and not ran.alike
 
 
 # --- a run that failed although its log goes on ---------------------------------------------------

@@ -24,35 +24,27 @@ from grounded.accounts.returned import (
     OTHERS,
     Kind,
     Story,
-    Suspicion,
     likeliest,
     scored,
     stories,
     suspicion,
     unit_by_factor,
 )
-from grounded.accounts.sent import follows, latest
+from grounded.accounts.sent import Fed, Ran, follows, latest
 from grounded.accounts.table import Account
 from grounded.checks import refused
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Quantity, Weight, found
 from grounded.search.candidate import Candidate
 from grounded.task import Task
-from grounded.trial import interpolate_gaps
+from grounded.trial import Trial, interpolate_gaps
 from grounded_trials.logs.log_table import misread
 from grounded_trials.workspace.candidates.search_state import latest_candidates
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.identity import other_task, sha256
 from grounded_trials.workspace.intake.log_faults import column_faults, not_the_logs
-from grounded_trials.workspace.intake.look import (
-    elsewhere,
-    fall_in,
-    sender_of,
-)
-from grounded_trials.workspace.intake.opening.foreign import (
-    cut_log,
-    cut_short,
-)
+from grounded_trials.workspace.intake.look import elsewhere, fall_in
+from grounded_trials.workspace.intake.opening.foreign import cut_log, cut_short
 from grounded_trials.workspace.intake.opening.reading import Read
 from grounded_trials.workspace.intake.opening.run_start import TRIED, Recording, Start
 
@@ -85,42 +77,49 @@ class Case:
         self.whole = interpolate_gaps(cut).trial
         self.log = log.recording if log else None
         self.guessed = {*self.log.names[0]} - {*self.log.measured} if self.log else set[str]()
-        seen = self._judged()
+        # the samples that were acted on, and where the run begins in them
+        self.samples, self.begins = self.log or (log.anywhere if log else None), 0.0
         if self.log and read.log:
-            seen = self._located(self.log, read.log, seen)
-        elif log and read.cut and log.spanned and (seen.why or seen.other) and log.anywhere:
-            begins = 1e-9 * (read.cut.start_ns - log.anywhere.whole.origin_ns)
-            given = Start(begins, 0.0, alike=True, opens_alike=True)
-            if sender_of(log.anywhere, self.own, [], lambda _: given).sure:
-                seen = replace(seen, why=None, other="")
-        self.seen, judged = seen, read.log is not None and not seen.other
-        self.fell = fall_in(self.task, self.own, self.read.trial, seen.ran) if judged else None
-        self.rival = next((one for one in self.rivals if one.id == seen.other), None)
+            self.begins = self._located(self.log, read.log)
+        elif self.samples and read.cut:
+            self.begins = 1e-9 * (read.cut.start_ns - self.samples.whole.origin_ns)
+        logged = self.log.measured if self.log else None
+        self.seen = suspicion(self.task, self.whole, self.own, self.rivals, logged, self.given)
+        judged = read.log is not None and not self.seen.other
+        fell = fall_in(self.task, self.own, self.read.trial, self.seen.ran) if judged else None
+        self.fell = fell
+        self.rival = next((one for one in self.rivals if one.id == self.seen.other), None)
         self.again = NextCommand("ingest", (str(path) if read.log else "LOG",))
 
     @cached_property
-    def start_of(self) -> Callable[[Candidate], Start | None]:
+    def start_of(self) -> Callable[[Any], Start | None]:
         """Where a candidate's run seems to begin in the log, if anywhere."""
         log = self.log
         return cache(lambda one: log.start_of(one.policy) if log else None)
 
-    def _judged(self) -> Suspicion:
-        """Return whose run the one that was cut seems to be by its commands."""
-        logged = self.log.measured if self.log else None
-        return suspicion(self.task, self.whole, self.own, self.rivals, logged)
+    def given(self, one: Ran) -> Iterator[tuple[Trial, Fed | None]]:
+        """Yield the run if it is a candidate's, and what that may have been fed in it."""
+        log, run, begins = self.samples, self.whole, {self.begins}
+        if log is None:
+            yield run, None
+            return
+        yield run, log.fed(one.policy, self.begins, run.until(self.task.horizon))
+        if one.id != self.own.id and self.log:  # its run may begin otherwise
+            if fit := follows(one.policy, run.until(self.task.horizon), latest(self.task)):
+                begins.add(self.begins + fit.late * self.task.dt)
+            if not (self.found and self.found.alike) and (begun := self.start_of(one)):
+                begins |= {begun.seconds} if begun.opens_alike else set()
+            for at in begins - {self.begins}:
+                if other := log.trial_from(at):
+                    yield other, log.fed(one.policy, at, other.until(self.task.horizon))
 
-    def _located(self, log: Recording, stored: ForeignLog, seen: Suspicion) -> Suspicion:
-        """Cut the run where it begins in the log; return whose it is then."""
+    def _located(self, log: Recording, stored: ForeignLog) -> float:
+        """Cut the run where it begins in the log; return when that is [s]."""
         self.found = start = self.start_of(self.own)
-        sender = sender_of(log, self.own, self.rivals, self.start_of)
-        if start and elsewhere(log, start, self.own.policy, why=bool(seen.why)):
-            self._cut(stored, start)
-            seen = self._judged()
-        if sender.sure:
-            return replace(seen, why=None, other="")
-        if sender.other:
-            return replace(seen, why=sender.why, other=sender.other)
-        return seen
+        if start is None or not elsewhere(log, start, self.own.policy):
+            return log.first
+        self._cut(stored, start)
+        return start.seconds
 
     def _cut(self, stored: ForeignLog, start: Start) -> None:
         """Cut the run from a log where it begins; of another log, from its samples too."""

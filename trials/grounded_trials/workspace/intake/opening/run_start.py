@@ -16,20 +16,15 @@ candidate that ran reproduces the logged commands, mostly to the last digits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from grounded.accounts.levels import EXACT as TO_DIGITS
 from grounded.accounts.levels import FINE, HALF, STEPS_TO_JUDGE
-from grounded.accounts.sent import (
-    WINDOWS,
-    follows,
-)
+from grounded.accounts.sent import Commanded, Fed, Following, commanded, follows, size_of
 from grounded.errors import GroundedError
 from grounded.frozen import Array
 from grounded.policy import Policy
@@ -45,7 +40,7 @@ OLDEST = 2.0  # largest age of a sample, in steps
 AGES = 128  # largest number of ages tried per topic
 AGES_BETWEEN = 8  # number of ages tried in the time between samples
 ROUNDS = 2  # rounds of coordinate search over the topics' ages
-FEW, FEWEST = 4, 0.2  # smallest number of informative steps in a part, and their share to be exact
+MOVES = (0.0, -0.5, 0.5, -1.0, 1.0)  # [steps] about the likeliest ages that may occur as well
 TRIED = 5  # number of best-fitting instants that are examined
 HELD = 3.5  # steps without a change of commands before an instant that may begin a run
 FINEST = 8  # largest number of instants per step at which a start is tried
@@ -60,9 +55,18 @@ class Start:
 
     seconds: float  # after the log's first sample
     apart: float  # mean difference of the commands there, in units of each input's size
-    alike: bool  # the commands are the policy's from there on
-    opens_alike: bool  # at least the first commands are; somebody may have taken over later
-    exact: bool = False  # most commands are the policy's to the last digits, and no part is not
+    ran: Following  # the comparison of the commands from there on
+    opens: bool = False  # the first commands are the policy's, whatever was sent later
+
+    @property
+    def alike(self) -> bool:
+        """Whether the commands are the policy's from there on."""
+        return self.ran.exact or (self.ran.alike and not self.ran.late)
+
+    @property
+    def opens_alike(self) -> bool:
+        """Whether at least the first commands are; somebody may have taken over later."""
+        return self.alike or self.opens or self.ran.opens
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,42 +133,35 @@ class Recording:
         """Find where a policy's run begins; return None if the log is too short."""
         if (policy.state_names, policy.input_names) != self.names or policy.dt != self.dt:
             return None
-        starts = self._starts(policy, instants_apart(self.whole, self.parts, policy))
-
+        starts = [*self._starts(policy, instants_apart(self.whole, self.parts, policy))]
         # The mean difference is affected by other commands sent in place of the first steps, and by
         # commands at their limits, which contain no timing. The median on the samples that the
         # program acted on is not.
+        if exact := [one for one in starts if one.ran.exact]:
+            return min(exact, key=lambda one: one.ran.usual)
         alike = [one for one in starts if one.alike]
         likeliest = min(alike or starts, key=lambda one: one.apart, default=None)
-        if likeliest is None:
-            return None
-        near = [one for one in starts if HALF * one.apart <= likeliest.apart] if alike else []
-        if len(near) == 1:
+        if likeliest is None or not alike:
             return likeliest
-        fits = [(acted_on(self, policy, one.seconds), one) for one in near or [likeliest]]
-        told = [(fit, one) for fit, one in fits if fit is not None and fit.enough]
-        fit, best = min(told, key=lambda pair: pair[0].left, default=(None, likeliest))
-        if fit is not None and fit.throughout:
-            return replace(best, alike=True, opens_alike=True, exact=True)
-        usual = next((other.left for other, one in told if one is likeliest), 0.0)
-        if fit is not None and alike and fit.left < HALF * usual:
-            return replace(best, opens_alike=True)
-        return likeliest
+        near = [one for one in starts if HALF * one.apart <= likeliest.apart]
+        best = min(near, key=lambda one: one.ran.usual)
+        return (
+            replace(best, opens=True) if best.ran.usual < HALF * likeliest.ran.usual else likeliest
+        )
 
-    def _starts(self, policy: Policy, apart: Array) -> list[Start]:
-        """Return the likeliest starts, by the difference of the commands from each instant on."""
-        found, left = list[Start](), apart.copy()
-        while len(found) < TRIED and np.isfinite(left).any():
+    def _starts(self, policy: Policy, apart: Array) -> Iterator[Start]:
+        """Yield the likeliest starts, by the difference of the commands from each instant on."""
+        left, tried = apart.copy(), list[float]()
+        while len(tried) < TRIED and np.isfinite(left).any():
             k = int(np.argmin(left))
-            left[max(0, k - self.parts) : k + self.parts + 1] = np.inf
+            left[max(0, k - self.parts + 1) : k + self.parts] = np.inf
             seconds = self.on_step(policy, self.first + k * self.dt / self.parts)
-            trial = self.trial_from(seconds)
-            fit = None if trial is None else follows(policy, trial.until(policy.horizon), 0)
-            if trial is not None and fit is not None:
-                alike = fit.alike and not fit.late
-                opens = alike or fit.opens
-                found.append(Start(seconds, float(apart[k]), alike, opens))
-        return found
+            trial = None if seconds in tried else self.trial_from(seconds)
+            run = None if trial is None else trial.until(policy.horizon)
+            fit = None if run is None else follows(policy, run, 0, self.fed(policy, seconds, run))
+            if fit is not None:
+                tried.append(seconds)
+                yield Start(seconds, float(apart[k]), fit)
 
     def apart_at(self, policy: Policy, start: float) -> float:
         """Return the mean difference of the commands from an instant on, as `Start.apart`."""
@@ -183,18 +180,45 @@ class Recording:
         phase, _ = found
         if abs(phase) < dt / 4:
             return start + phase
-        tried = [start + phase + move * dt for move in (-1, 0, 1)]
-        return min(tried, key=lambda at: self._misfit(policy, at))
+        tried = [start + phase + move * dt for move in (0, -1, 1)]
+        return min(tried, key=lambda at: self.apart_at(policy, at))
 
-    def _misfit(self, policy: Policy, start: float) -> float:
-        """Return the mean difference of the commands from a start on, in units of their size."""
-        trial = self.trial_from(start)
-        if trial is None or trial.finite_steps < STEPS_TO_JUDGE:
-            return np.inf
-        lasting = min(trial.finite_steps, policy.horizon)
-        sent = np.clip(trial.inputs[:lasting], policy.low, policy.high)
-        asked = policy.commands(trial.states[None, :lasting], policy.past)[0]
-        return float((np.abs(asked - sent) / (np.abs(sent).max(axis=0) + 1e-12)).mean())
+    def fed(self, policy: Policy, start: float, run: Trial) -> Fed | None:
+        """Return the states that a policy may have been fed in a run, near the likeliest ages.
+
+        Samples are held or interpolated; topics with stamps of their own have ages of their own.
+        """
+        T = min(run.finite_steps, policy.horizon)
+        if policy.gain is None or T < STEPS_TO_JUDGE:
+            return None
+        topics, finest, aged = _aged(self, round(start * 1e9), T)
+        run = run.until(T)
+
+        def scores(states: Array) -> Array:
+            apart = commanded(policy, run, states).apart
+            mean: Array = np.log(apart**2 + FINE**2).mean(axis=1)  # outliers count little
+            return mean
+
+        found = list[tuple[float, Array, Array]]()
+        for states in aged:
+            each = scores(states)
+            ages = np.full(len(run.state_names), int(np.argmin(each)))
+            for topic in topics * ROUNDS if len(topics) > 1 else ():
+                tried = np.repeat(_of(states, ages)[None], len(states), axis=0)
+                tried[:, :, topic] = states[:, :, topic]
+                each = scores(tried)
+                ages[topic] = int(np.argmin(each))
+            found.append((float(each.min()), states, ages))
+        _, states, ages = min(found, key=lambda one: one[0])
+        moves = np.round(np.array(MOVES) * self.dt / finest).astype(int)
+        near = np.clip(ages + moves[:, None], 0, len(states) - 1)
+        old = (ages.mean() - 2) * finest / self.dt
+        return Fed(np.stack([_of(states, k) for k in near]), [float(old + d) for d in MOVES])
+
+
+def _of(states: Array, ages: Ints) -> Array:
+    """Return the states (T, n), each at its age, of those of all ages (A, T, n)."""
+    return np.stack([states[k, :, i] for i, k in enumerate(ages)], axis=1)
 
 
 def recording(
@@ -277,102 +301,27 @@ def _off(
 ) -> Iterator[tuple[Any, Any, Any]]:
     """Yield instants (K,), differences of the commands from there (K, H), and which are known."""
     states, H = log.states, policy.horizon
-    sent, width = np.clip(log.inputs, policy.low, policy.high), policy.high - policy.low
-    size = np.maximum(np.abs(sent).max(axis=0), np.abs(policy.feedforward).max(axis=0))
-    size = size + np.where(np.isfinite(width), 0.1 * width, 1e-12)
+    sent = np.clip(log.inputs, policy.low, policy.high)
+    size = size_of(policy, sent)
     steps = parts * np.arange(H)
     for at in range(0, len(wanted), BATCH):
         ks = np.array(wanted[at : at + BATCH])
         x = states[np.minimum(ks[:, None] + steps, len(states) - 1)]
         here = ks[:, None] + steps + parts // 2
         u = sent[np.minimum(here, len(sent) - 1)]
-        off = (np.abs(policy.commands(x, policy.past) - u) / size).mean(axis=2)
-        yield ks, off, here < len(sent)
+        yield ks, Commanded(u, policy.commands(x, policy.past), size).apart, here < len(sent)
 
 
 # --- the samples that the program acted on -------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class ActedOn:
-    """The differences of a log's commands from a policy's, on the samples it may have acted on."""
-
-    off: Array  # (T,) rms over inputs, in units of their size; NaN if all are at their limits
-    asked: Array  # (T, m) what the policy sends
-    size: Array  # (m,) the largest value of each input
-
-    @cached_property
-    def told(self) -> Array:
-        """The informative steps, (T,) bool: those with an input inside its limits."""
-        return np.isfinite(self.off)
-
-    @property
-    def enough(self) -> bool:
-        """Whether enough steps are informative; few are if all are the policy's to the last digits.
-
-        An input at its limits most of the time leaves few.
-        """
-        few = self.told.sum() >= FEW and float(self.off[self.told].max()) < TO_DIGITS
-        return bool(few or self.told.sum() >= STEPS_TO_JUDGE)
-
-    @property
-    def exact(self) -> bool:
-        """Whether at least half of the commands are the policy's to the last digits."""
-        return self.enough and self.left < TO_DIGITS
-
-    @property
-    def throughout(self) -> bool:
-        """Whether the commands are exact, also in every part of the run."""
-        parts = (one[np.isfinite(one)] for one in np.array_split(self.off, WINDOWS))
-        return self.exact and all(
-            len(one) < FEW or np.mean(one < TO_DIGITS) > FEWEST for one in parts
-        )
-
-    @property
-    def left(self) -> float:
-        """The median difference of the commands, which is robust to lost packets."""
-        return float(np.median(self.off[self.told])) if self.told.any() else np.inf
-
-
-def acted_on(log: Recording, policy: Policy, start: float) -> ActedOn | None:
-    """Compare the commands of a log with a policy's, at the ages of samples that fit best.
-
-    Returns:
-        The differences; None if the log can't be cut there, or is too short.
-    """
-    trial = log.trial_from(start)
-    if trial is None or (T := min(trial.finite_steps, policy.horizon)) < STEPS_TO_JUDGE:
-        return None
-    sent = np.clip(trial.inputs[:T], policy.low, policy.high)
-    past = policy.past if trial.start_inputs is None else trial.start_inputs
-    size = np.maximum(np.abs(policy.feedforward).max(axis=0), np.abs(sent).max(axis=0)) + 1e-12
-
-    def asked(states: Array) -> Array:
-        return policy.commands(states, past, sent[None])
-
-    def scores(states: Array) -> Array:
-        squares = (((asked(states) - sent) / size) ** 2).mean(axis=2)
-        mean: Array = np.log(squares + FINE**2).mean(axis=1)  # outliers count little
-        return mean
-
-    if policy.gain is None:
-        found = np.zeros((1, T, len(policy.state_names)))
-    else:
-        topics, aged = _aged(log, round(start * 1e9), T)
-        tried = [_likeliest(one, topics, scores) for one in aged]
-        found = min(tried, key=lambda one: scores(one)[0])
-    u = asked(found)[0]
-    free = ((u > policy.low) & (u < policy.high)) | ((sent > policy.low) & (sent < policy.high))
-    off = np.sqrt((((u - sent) / size) ** 2).mean(axis=1))
-    return ActedOn(np.where(free.any(axis=1), off, np.nan), u, size)
-
-
-def _aged(log: Recording, start: int, steps: int) -> tuple[list[list[int]], list[Array]]:
+def _aged(log: Recording, start: int, steps: int) -> tuple[list[list[int]], float, list[Array]]:
     """Return the states of a log at all ages that they may have had when commands were sent.
 
     Returns:
-        The groups of states with the same time stamps, which are equally old; and the states,
-        (ages, T, n): held from sample to sample (but for those that were estimated), and between.
+        The groups of states with the same time stamps, which are equally old; the time from age to
+        age [s]; and the states, (ages, T, n): held from sample to sample (but for those that were
+        estimated), and between.
     """
     names, inputs = log.names
     states = [tidy(n, log.series[n], unwrap=n in log.angles) for n in names]
@@ -390,17 +339,7 @@ def _aged(log: Recording, start: int, steps: int) -> tuple[list[list[int]], list
         last = np.clip(np.searchsorted(one.t, at, "right") - 1, 0, len(t) - 1)
         between.append(np.interp((at - one.t[0]).ravel(), t, y).reshape(at.shape))
         held.append(y[last] if name in log.logged else between[-1])
-    return [*together.values()], [np.stack(some, axis=2) for some in (held, between)]
-
-
-def _likeliest(aged: Array, topics: list[list[int]], scores: Callable[[Array], Array]) -> Array:
-    """Return the states at the ages that fit best, (1, T, n), of those by `_aged`."""
-    found = aged[[int(np.argmin(scores(aged)))]]
-    for topic in topics * ROUNDS if len(topics) > 1 else ():
-        tried = np.repeat(found, len(aged), axis=0)
-        tried[:, :, topic] = aged[:, :, topic]
-        found = tried[[int(np.argmin(scores(tried)))]]
-    return found
+    return [*together.values()], finest, [np.stack(some, axis=2) for some in (held, between)]
 
 
 def _sent_at(sent: Sequence[Samples], begin: int, dt: float, steps: int) -> Ints:
