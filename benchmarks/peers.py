@@ -22,7 +22,7 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 from helpers import fastest
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.experiments.car_tasks import car_task
 from grounded.experiments.figure8 import flight_task
 from grounded.models import aircraft, car

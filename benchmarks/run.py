@@ -24,7 +24,7 @@ import numpy as np
 from helpers import fastest, grounded, python
 from peers import CLOSE, case
 
-from grounded.compile import DescentOptions
+from grounded.compile.problem import DescentOptions
 from grounded.solve.ddp import solve
 
 HERE = Path(__file__).parent

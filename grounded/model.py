@@ -15,6 +15,7 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, partial
+from itertools import chain
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -231,9 +232,9 @@ class Model:
 
     def _check_names(self) -> None:
         of_kind = {"state": self.states, "input": self.inputs, "parameter": self.params}
-        for name in [name for names in of_kind.values() for name in names]:
-            kinds = tuple(kind for kind, names in of_kind.items() if name in names)
-            if len(kinds) > 1:
+        for name in chain.from_iterable(of_kind.values()):
+            if (name in self.states) + (name in self.inputs) + (name in self.params) > 1:
+                kinds = tuple(kind for kind, names in of_kind.items() if name in names)
                 raise refused("given.twice", f"model '{self.name}'", name=name, kinds=kinds)
             if not name.isidentifier():
                 raise wrong(f"a name of model '{self.name}'", name, must="name")
@@ -298,7 +299,7 @@ class Model:
     @cached_property
     def angle_mask(self) -> Any:
         """Which states are angles, (n,) bool."""
-        return readonly([name in self.angles for name in self.states], dtype=np.bool_)
+        return readonly(np.isin(self.state_names, self.angles), dtype=np.bool_)
 
     @cached_property
     def system(self) -> System:

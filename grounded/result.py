@@ -71,7 +71,7 @@ def or_zero(value: float, *scale: float) -> float:
         value: a number to be shown, such as one end of a range.
         scale: others of its kind and unit, such as the other end, or its standard deviation.
     """
-    size = max((abs(one) for one in scale if isfinite(one)), default=0.0)
+    size = max(map(abs, filter(isfinite, scale)), default=0.0)
     return 0.0 if abs(value) <= ROUNDING * size else value
 
 
@@ -130,10 +130,13 @@ def measured(value: float, unit: str) -> str:
 
 def measured_alike(values: Sequence[float], unit: str) -> list[str]:
     """Format errors that are compared, like `measured`, in the unit of their geometric mean."""
-    values = [or_zero(v, *values) for v in values]
-    known = [v for v in values if 0 < v < math.inf]
-    middle = math.exp(sum(map(math.log, known)) / len(known)) if known else 0.0
-    return [_told(value, *_scale(middle, unit), FIXED) for value in values]
+    total, count, found = 0.0, 0, list[float]()
+    for value in values:
+        found.append(or_zero(value, *values))
+        if 0 < found[-1] < math.inf:
+            total, count = total + math.log(found[-1]), count + 1
+    scale = _scale(math.exp(total / count) if count else 0.0, unit)
+    return [_told(value, *scale, FIXED) for value in found]
 
 
 def _scale(value: float, unit: str) -> tuple[float, str]:

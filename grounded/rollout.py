@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.frozen import Array, readonly, wrapped
 from grounded.model import Model
 from grounded.policy import Policy

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 from dataclasses import dataclass, fields
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,13 +25,15 @@ from grounded.checks import (
     whole_number,
     wrong,
 )
-from grounded.compile import Problem
 from grounded.frozen import Array
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.result import with_unit
 from grounded.trial import Trial
 from grounded.utility import Reward, step_rewards
+
+if TYPE_CHECKING:
+    from grounded.compile.problem import Problem
 
 MAX_HORIZON = 200_000  # control steps; each needs a few kB for its gains
 HELD = 1e-6  # tolerance, as a fraction of an input's range, for a rounded held input at its limit
@@ -95,7 +98,7 @@ class Task:
         whole_number("task: horizon", H, 1, MAX_HORIZON)
         stated = getattr(self.model.step, "latency", {})
         defaults = {
-            "latency": np.array([stated.get(name, 0.0) for name in self.model.input_names]),
+            "latency": np.array([*map(stated.get, self.model.input_names, [0.0] * m)]),
             "input_target": np.zeros((H, m)),
             "safety_low": np.full(n, -np.inf),
             "safety_high": np.full(n, np.inf),
@@ -186,6 +189,8 @@ class Task:
             bias: (H, n) added to the model's next state at each step; None for zero.
             exact: switch off the smoothing of non-smooth terms.
         """
+        from grounded.compile.problem import Problem
+
         model, H = self.model, self.horizon
         weight = np.tile(self.reward.state, (H + 1, 1))
         weight[-1] += self.reward.terminal

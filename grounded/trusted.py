@@ -47,9 +47,9 @@ def check_own(folder: Path, paths: Iterable[Path]) -> None:
     Raises:
         GroundedError: for the first of them that another user may have changed.
     """
-    trusted = [Path(name).resolve() for name in os.environ.get(TRUST, "").split(os.pathsep) if name]
-    if any(folder.resolve().is_relative_to(known) for known in trusted):
-        return
+    for name in filter(None, os.environ.get(TRUST, "").split(os.pathsep)):
+        if folder.resolve().is_relative_to(Path(name).resolve()):
+            return
     for path in (folder, *paths):
         try:
             seen = suspicion(path)

@@ -18,7 +18,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from benchmarks.foreign.setups import Setup
-from grounded.compile import DescentOptions
+from grounded.compile.problem import DescentOptions
 from grounded.policy import Policy
 from grounded.search.ask_tell import learn
 from grounded.search.first_policy import first_policy

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +36,13 @@ def ingest(
     """Store logs, and print what became of each."""
     workspace, held = open_workspace(), values_by_name(before, "--before")
     about: Any = {"candidate": candidate, "data": data, "group": group, "before": held}
-    done = []
-    for name in (str(log) for file in files for log in logs_in(Path(file))):
+    done, earlier = list[Ingested](), list[Finding]()
+    for name in map(str, chain.from_iterable(map(logs_in, map(Path, files)))):
         with progress(f"reading {name}"):
             done.append(workspace.ingest(name, **about))
         if not json_asked():  # each at once, since the next one may be refused
-            earlier = [note for one in done[:-1] for note in one.findings]
             tell_ingested(name, done[-1], details, earlier)
+            earlier += done[-1].findings
     yield {"trials": [one.to_json() for one in done]}
     show(f"\n{next_line(done[-1].then)}")
 
@@ -50,8 +51,10 @@ def tell_ingested(name: str, one: Ingested, details: bool, earlier: Sequence[Fin
     """Print what became of a log; without details no note that was told of one before it."""
     if one.known:
         show(f"{name}: {one.trial}, stored before")
-    told = {(note.code, note.about) for note in earlier if note.weight is Weight.NOTE}
-    new = [note for note in one.findings if details or (note.code, note.about) not in told]
+    new = list(one.findings)
+    if earlier and not details:
+        told = {(note.code, note.about) for note in earlier if note.weight is Weight.NOTE}
+        new = [note for note in new if (note.code, note.about) not in told]
     tell(new, name, all_=details)
     if not one.known:
         show(f"{name}: {one.trial}")

@@ -14,35 +14,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from grounded.compile.names import Named, Signature
-from grounded.compile.problem import (
-    Backward,
-    Descent,
-    DescentOptions,
-    Integrator,
-    Kind,
-    Problem,
-    Status,
-    Swarm,
-    deepest,
-)
+from grounded.compile.names import Integrator, Kind, Named, Signature
 
 if TYPE_CHECKING:
     from grounded.compile.run.interpreted import System
 
-__all__ = [
-    "Backward",
-    "Descent",
-    "DescentOptions",
-    "Kind",
-    "Named",
-    "Problem",
-    "Signature",
-    "Status",
-    "Swarm",
-    "deepest",
-    "system_of",
-]
+__all__ = ["Kind", "Named", "Signature", "system_of"]
 
 
 def system_of(

@@ -12,17 +12,46 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from grounded.checks import refused, unknown, wrong
-from grounded.compile.problem import Integrator, Kind, integrated
 from grounded.errors import GroundedError
 from grounded.foreign import contained
 from grounded.frozen import Array
 
 _NOT_THE_USER = (str(Path(__file__).parents[1]), str(Path(np.__file__).parent), "<frozen")
+STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with what weight
+    "rk4": ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)),
+    "euler": ((0.0, 1.0),),
+}
+
+
+def integrated(
+    rate: Callable[[list[Any]], Sequence[Any]],
+    x: list[Any],
+    dt: Any,
+    integrator: str,
+    count: int = 1,
+) -> list[Any]:
+    """The values x after dt, by `count` equal steps: numbers, arrays, expressions alike.
+
+    `rate` are the values' rates at such values, `integrator` a name in STAGES.
+    """
+    h = dt / count if count > 1 else dt
+    for _ in range(count):
+        k, moved = list[Any](), x
+        for c, b in STAGES[integrator]:
+            at = [xi + c * h * ki for xi, ki in zip(x, k, strict=True)] if c else x
+            k = [*rate(at)]
+            moved = [m + b * h * ki for m, ki in zip(moved, k, strict=True)]
+        x = moved
+    return x
+
+
+Kind = Literal["derivative", "step"]
+Integrator = Literal["rk4", "euler"]
 
 
 class Named(Mapping[str, Any]):
@@ -92,7 +121,7 @@ class Signature:
 
     def steps(self, x: Array, u: Array, p: Array, dt: float) -> Array:
         """The next states (N, n) of a step, called sample by sample; NaN where that is an error."""
-        found, values = np.full(x.shape, np.nan), [np.float64(v) for v in p]
+        found, values = np.full(x.shape, np.nan), [*map(np.float64, p)]
         for k, (at, sent) in enumerate(zip(x, u, strict=True)):
             try:
                 after = self.call(list(at), list(sent), values, np.float64(dt))
@@ -125,7 +154,7 @@ class Signature:
         def rate(at: list[Any]) -> list[Any]:
             values = self.function(Named("state", self.states, at), a, p)
             check_names(values, self.states, self.function)
-            return [values[name] for name in self.states]
+            return [*map(values.__getitem__, self.states)]
 
         return dict(zip(self.states, integrated(rate, x, dt, *self.within), strict=True))
 
@@ -161,6 +190,8 @@ def check_names(values: Any, states: Sequence[str], function: Any) -> None:
     if not isinstance(values, Mapping):
         kind = type(values).__name__
         raise refused("model.returns", where(function), type=kind, states=tuple(states))
+    if values.keys() == {*states}:
+        return
     extra = [name for name in values if name not in states]
     if extra:
         raise unknown("state", extra[0], states, "the model", where(function))

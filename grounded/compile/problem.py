@@ -23,10 +23,9 @@ turns it into a status.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,36 +51,6 @@ NO_CHANGE = 1e-14  # a predicted change that is none
 Status = Literal["converged", "no improvement", "max iterations", "not finite"]
 STATUSES: tuple[Status, ...] = ("converged", "no improvement", "max iterations", "not finite")
 
-STAGES: dict[str, tuple[tuple[float, float], ...]] = {  # (c, b): where and with what weight
-    "rk4": ((0.0, 1 / 6), (0.5, 1 / 3), (0.5, 1 / 3), (1.0, 1 / 6)),
-    "euler": ((0.0, 1.0),),
-}
-
-
-def integrated(
-    rate: Callable[[list[Any]], Sequence[Any]],
-    x: list[Any],
-    dt: Any,
-    integrator: str,
-    count: int = 1,
-) -> list[Any]:
-    """The values x after dt, by `count` equal steps: numbers, arrays, expressions alike.
-
-    `rate` are the values' rates at such values, `integrator` a name in STAGES.
-    """
-    h = dt / count if count > 1 else dt
-    for _ in range(count):
-        k, moved = list[Any](), x
-        for c, b in STAGES[integrator]:
-            at = [xi + c * h * ki for xi, ki in zip(x, k, strict=True)] if c else x
-            k = [*rate(at)]
-            moved = [m + b * h * ki for m, ki in zip(moved, k, strict=True)]
-        x = moved
-    return x
-
-
-Kind = Literal["derivative", "step"]
-Integrator = Literal["rk4", "euler"]
 Limits = tuple[Array, Array]
 
 

@@ -38,7 +38,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.engine import Engine
 from grounded.experiments.jobs import Progress, Study, StudyTable, mean_se, mean_text, run_jobs
 from grounded.frozen import Array

@@ -168,6 +168,8 @@ def settle(findings: Iterable[Finding]) -> tuple[Finding, ...]:
         known = once.setdefault((one.code, one.about), one)
         if ORDER.index(one.weight) < ORDER.index(known.weight):
             once[one.code, one.about] = one
+    if len(once) < 2:
+        return tuple(once.values())
     kept = [
         one
         for one in once.values()

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from grounded.figures import Figure, curve, panel
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.result import Result, document, figure, shown
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.figures import Figure
 
 Way = Literal[
     "",  # a step along the direction of the model that replays the incumbent's trial
@@ -121,6 +123,8 @@ class Candidate(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of the predicted states and inputs over time."""
+        from grounded.figures import Figure, curve, panel  # that no `ingest` draws
+
         columns = [*zip(self.policy.state_names, self.predicted_states.T, strict=True)]
         columns += zip(self.policy.input_names, self.predicted_inputs.T, strict=True)
         panels = []

@@ -19,8 +19,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile import Problem, deepest
-from grounded.compile.problem import Controls, Samples
+from grounded.compile.problem import Controls, Problem, Samples, deepest
 from grounded.compile.run.interpreted import System
 from grounded.frozen import Array, wrapped
 from grounded.policy import Policy

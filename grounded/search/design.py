@@ -34,7 +34,7 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.diagnosis.hypotheses.variations import in_place
 from grounded.diagnosis.levels import NATS
 from grounded.diagnosis.likelihood.data import Data, prepare

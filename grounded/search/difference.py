@@ -13,10 +13,10 @@ a good one.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import pairwise
+from itertools import chain, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,9 +67,9 @@ class Repeats:
             with np.errstate(over="ignore", invalid="ignore"):  # diverged runs
                 total = float(np.var(one.utilities)) * runs if differ else 0.0
             rows.append((one.utility, runs - 1.0, total))
-        if any(total for *_, total in rows):  # then identical runs must be copies
-            rows = [row for row in rows if row[2]]
-        self.rows = np.array(rows).reshape(len(rows), 3)
+        found = np.array(rows).reshape(len(rows), 3)
+        # identical runs must be copies if others scatter
+        self.rows = found[found[:, 2] != 0] if found[:, 2].any() else found
 
     def near(self, utility: float) -> Scatter:
         """Return the scatter of runs of about this utility; none if all repeats agree exactly."""
@@ -270,18 +270,17 @@ def judged(
     incumbent: Tried | None = None
     iteration = losses = 0  # accepted improvements; steps from the incumbent that did not improve
     exact = False  # whether the system has repeated itself to the last bit
-    known = {trial.id for trial in trials}
-    runs: dict[str, list[Trial]] = {one.id: [] for one in candidates}
+    known, runs = {trial.id for trial in trials}, {one.id: list[Trial]() for one in candidates}
     for trial in trials:
         if trial.candidate in runs:
             runs[trial.candidate].append(trial.whole(task.horizon))
-    every = [trial for some in runs.values() for trial in some]
+    every = [*chain.from_iterable(runs.values())]
     spent, agree = len(every) >= options.max_trials, not scattered(every)
     for candidate in candidates:
         own = tuple(runs[candidate.id])
-        utilities = tuple(task.utility(t) for t in own)
-        gone = tuple(one for one in candidate.seen if one not in known)
-        failed = any(u == -np.inf for u in utilities)
+        utilities = tuple(map(task.utility, own))
+        gone = () if known.issuperset(candidate.seen) else _missing(candidate, known)
+        failed = -np.inf in utilities
         exact = exact or (agree and any(one.repeats(other) for one, other in pairwise(own)))
         enough = min(options.repeats, len(own)) if exact and own else options.repeats
         if len(own) < enough and not failed:
@@ -294,9 +293,9 @@ def judged(
             iteration += incumbent is not None
             incumbent, losses = tried, 0
             # a loss that was in doubt is one: this candidate beat both runs
-            history = [
-                replace(t, accepted=False, in_doubt=False) if t.in_doubt else t for t in history
-            ]
+            for k, one in enumerate(history):
+                if one.in_doubt:
+                    history[k] = replace(one, accepted=False, in_doubt=False)
         elif incumbent is not None and (candidate.base, candidate.model) == (
             incumbent.candidate.id,
             model,
@@ -307,8 +306,15 @@ def judged(
                 tried = replace(tried, accepted=None, in_doubt=True)
         history.append(tried)
     told = _told(task, history, trials)
-    best = next((t for t in told if incumbent and t.candidate is incumbent.candidate), None)
+    best = None
+    for tried in told if incumbent else ():
+        best = tried if incumbent and tried.candidate is incumbent.candidate else best
     return told, best, iteration
+
+
+def _missing(candidate: Candidate, known: Container[str]) -> tuple[str, ...]:
+    """Return the trials that a candidate was made from and that are not known any more."""
+    return tuple(one for one in candidate.seen if one not in known)
 
 
 def _told(task: Task, history: Sequence[Tried], trials: Sequence[Trial]) -> tuple[Tried, ...]:

@@ -26,7 +26,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from grounded.compile import DescentOptions, Problem
+from grounded.compile.problem import DescentOptions, Problem
 from grounded.compile.run.interpreted import tracking_error
 from grounded.frozen import Array
 from grounded.policy import Policy

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from grounded.compile import DescentOptions, Problem
+from grounded.compile.problem import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
 from grounded.rollout import Rollout, apart, for_late_samples

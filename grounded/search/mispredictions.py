@@ -50,7 +50,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.frozen import Array, wrapped
 from grounded.policy import Policy
 from grounded.rollout import Run, apart, augmented

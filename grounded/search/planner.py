@@ -19,7 +19,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from grounded.checks import known
-from grounded.compile import deepest
 from grounded.model import Model
 from grounded.policy import Policy
 from grounded.task import Task
@@ -27,7 +26,7 @@ from grounded.trial import Trial
 from grounded.utility import Reward
 
 if TYPE_CHECKING:
-    from grounded.compile import Problem
+    from grounded.compile.problem import Problem
     from grounded.effects import Effect, Library
     from grounded.rollout import Rollout
     from grounded.search.first_policy import Tick
@@ -100,6 +99,8 @@ class Planner:
 
     def widened(self, policy: Policy) -> Policy:
         """Return a robot's policy over the planning model's z."""
+        from grounded.compile.problem import deepest
+
         model = self.plan.model
         angles = tuple(bool(a) for a in model.angle_mask)
         depths = deepest(self.plan.problem().depths, policy.depths)
@@ -111,6 +112,8 @@ class Planner:
         They may have been made with a longer latency. Without the gains on the oldest inputs such a
         loop would seem unstable.
         """
+        from grounded.compile.problem import deepest
+
         own = depths = self.plan.problem().depths
         for policy in policies:
             depths = deepest(depths, policy.depths)
@@ -181,6 +184,7 @@ def model_fingerprint(task: Task) -> str:
 
 def predicted(problem: Problem, policy: Policy) -> Rollout:
     """Simulate a robot's policy in a model that may have more states than the robot measures."""
+    from grounded.compile.problem import deepest
     from grounded.rollout import simulate
 
     angles = tuple(map(bool, problem.angles))

@@ -22,18 +22,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from html import escape
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from grounded.errors import NextCommand
-from grounded.figures import Figure
 from grounded.findings import Finding, found
 from grounded.result import Result, document, figure, html_table, spread
 from grounded.search.candidate import BY_STEP, DOUBTFUL_GAIN, Candidate, Tried
 from grounded.search.difference import LUCK, Difference, judged, last_gain
-from grounded.search.pictures import search_figure
 from grounded.search.step_size import SearchOptions, Step, losers_of
 from grounded.task import Task
 from grounded.trial import Trial
+
+if TYPE_CHECKING:
+    from grounded.figures import Figure
 
 
 class Phase(StrEnum):
@@ -209,6 +210,8 @@ class Standing(Result):
 
     def figures(self) -> Sequence[Figure]:
         """Return the figure of utilities by candidate and step sizes."""
+        from grounded.search.pictures import search_figure  # that no `ingest` draws
+
         found = search_figure(self)
         return () if found is None else (found,)
 
@@ -330,6 +333,8 @@ def _hardly(
     model is given LOST candidates of its own. A candidate that failed, perhaps because somebody
     stopped its run, measured no gain and does not count, unless all of the last ones failed.
     """
+    if len(history) <= PATIENCE:
+        return None
     history = tuple(t for t in history if t.accepted is not False or t.lost)
     if not all(t.crashed for t in history[-PATIENCE:]):
         history = tuple(t for t in history if not t.crashed)
@@ -462,14 +467,14 @@ def _waiting(now: Standing, model: str) -> Tried | None:
     policy was made gentler, the run that a step starts from, or any other that the search knew. The
     one that was waiting before that trial then waits again.
     """
-    undecided = {t.candidate.id for t in now.history if t.accepted is None}
-    failed = sum(t.accepted is False for t in now.history)
     for tried in reversed(now.history):
         made = tried.candidate
         if tried.void or (tried.gone and tried.accepted is False and made.base):
             continue
         if tried.accepted is not None or made.model != model:
             return None
+        undecided = {t.candidate.id for t in now.history if t.accepted is None}
+        failed = sum(t.accepted is False for t in now.history)
         if made.base not in undecided and (made.base or made.caution <= failed):
             return tried
     return None

@@ -191,6 +191,9 @@ def losers_of(
     history: Sequence[Tried], base: str, model: str, way: Way | None = None
 ) -> list[Candidate]:
     """Return those made from `base` in this model, in this way if any, that did not improve."""
-    tried = [t for t in history if t.candidate.base == base and t.candidate.model == model]
-    lost = [t.candidate for t in tried if t.lost]
-    return [c for c in lost if way is None or c.way == way]
+    found = list[Candidate]()
+    for tried in history:
+        made = tried.candidate
+        if (made.base, made.model) == (base, model) and tried.lost and way in (None, made.way):
+            found.append(made)
+    return found

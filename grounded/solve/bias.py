@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from grounded.checks import refused
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.frozen import Array, median
 from grounded.rollout import augmented
 from grounded.solve.levenberg_marquardt import LeastSquares, Rows, solve

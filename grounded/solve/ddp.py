@@ -34,7 +34,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from grounded.checks import of_shape, wrong
-from grounded.compile import Backward, Descent, DescentOptions, Problem, Status
 from grounded.compile.problem import (
     CEILING,
     FLOOR,
@@ -42,7 +41,12 @@ from grounded.compile.problem import (
     LARGE_MU,
     NO_CHANGE,
     SEARCH_FLOOR,
+    Backward,
     Controls,
+    Descent,
+    DescentOptions,
+    Problem,
+    Status,
 )
 from grounded.frozen import Array
 

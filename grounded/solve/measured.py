@@ -23,7 +23,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.compile.run.interpreted import Quadratic, diagonals, linearised
 from grounded.frozen import Array, wrapped
 

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from grounded.compile import Problem
+from grounded.compile.problem import Problem
 from grounded.compile.run.interpreted import linearised
 from grounded.frozen import Array, wrapped
 from grounded.rollout import simulate

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from grounded.compile import DescentOptions, system_of
+from grounded.compile import system_of
 from grounded.compile.kernel_words import MAX_INPUTS
 from grounded.compile.names import Signature
-from grounded.compile.problem import Controls
+from grounded.compile.problem import Controls, DescentOptions
 from grounded.compile.run.compiled import CompiledSystem, Kernels
 from grounded.compile.run.differenced import DifferencedSystem
 from grounded.compile.run.interpreted import System

@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from grounded.compile import DescentOptions
+from grounded.compile.problem import DescentOptions
 from grounded.compile.run.interpreted import box_qp
 from grounded.errors import GroundedError
 from grounded.model import Model, Param

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from grounded.compile import Problem, system_of
+from grounded.compile import system_of
+from grounded.compile.problem import Problem
 
 
 def double_integrator(s, a, p):

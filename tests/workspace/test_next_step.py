@@ -224,7 +224,7 @@ def test_another_model_or_other_limits_make_a_diagnosis_old(w):
         assert old in text
         file.write_text(text.replace(old, new))
         found = gather(Folder(w.folder)).since
-        assert found.changed == bool(found.finding) == changed
+        assert found.changed == bool(found.findings) == changed
         file.write_text(text)
 
 

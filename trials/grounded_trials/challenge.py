@@ -37,7 +37,7 @@ from grounded_trials.workspace.diagnosing import diagnose_in
 from grounded_trials.workspace.folder import Folder
 from grounded_trials.workspace.last_diagnosis import FILE as DIAGNOSIS
 from grounded_trials.workspace.last_diagnosis import write_diagnosis
-from grounded_trials.workspace.user_files.config import FILE, set_keys
+from grounded_trials.workspace.user_files.config import FILE
 from grounded_trials.workspace.user_files.task_file import write_target
 
 MANIFEST = "manifest.json"
@@ -82,12 +82,15 @@ def _write_case(case: Case, folder: Path) -> list[str]:
     task, model = case.task, case.task.model
     columns = {name: task.target[:, i] for i, name in enumerate(model.state_names)}
     write_target(folder / "target.csv", task.dt, columns)
-    text = toml_of(task, case.name)
-    write_atomically(folder / FILE, text[: text.index("\n[system]") + 1].encode())
-    params = dict(zip(model.param_names, model.values.tolist(), strict=True))
-    set_keys(
-        folder / FILE, "model", file="", module=f"grounded.models.{case.system}", params=params
+    values = ", ".join(
+        f"{name} = {float(value)!r}"
+        for name, value in zip(model.param_names, model.values, strict=True)
     )
+    lines = toml_of(task, case.name).split("\n")
+    at = next(i for i, line in enumerate(lines) if line.startswith("file ="))
+    lines[at : at + 1] = [f'module = "grounded.models.{case.system}"', f"params = {{ {values} }}"]
+    system = next(i for i, line in enumerate(lines) if line.startswith("[system]"))
+    write_atomically(folder / FILE, ("\n".join(lines[:system]) + "\n").encode())
     return [store.add(data).sha256 for data in files]
 
 

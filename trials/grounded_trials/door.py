@@ -200,9 +200,9 @@ class Workspace(Folder):
         from grounded_trials.workspace.intake.ingest import ingest_log
 
         about: dict[str, Any] = {"data": data, "group": group, "sent_before": before}
-        each = logs_in(path_of(path))
-        done = [ingest_log(self.forget(), log, candidate, **about) for log in each]
-        return done[-1]
+        for log in logs_in(path_of(path)):
+            done = ingest_log(self.forget(), log, candidate, **about)
+        return done
 
     def target(
         self,

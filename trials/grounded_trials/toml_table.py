@@ -21,7 +21,8 @@ from grounded.findings import found
 from grounded_trials.plain_file import read_file, unreadable
 
 SIZE_LIMIT = 2**22  # [bytes] of a file
-MUST_BE = {must: {"must": must} for must in ("positive", "natural")}  # metadata of a field
+# metadata of a field
+MUST_BE = {"positive": {"must": "positive"}, "natural": {"must": "natural"}}
 T = TypeVar("T")
 
 
@@ -115,8 +116,8 @@ class Table:
                 value = self.values[name]
                 if not isinstance(value, list) or len(value) != 2:
                     raise self.error(name, "pair", value)
-                low, high = (self._checked(name, v, float) for v in value)
-                found[name] = (low, high)
+                ends = self._checked(name, value[0], float), self._checked(name, value[1], float)
+                found[name] = ends
         return found
 
     def __contains__(self, key: str) -> bool:

@@ -19,7 +19,6 @@ import click
 
 from grounded.errors import NextCommand
 from grounded.findings.finding import Finding, Weight
-from grounded.progress import duration
 from grounded.result import plain
 from grounded_trials.wording import (
     ELSEWHERE,
@@ -44,7 +43,8 @@ EVERY = 30.0  # seconds between progress lines when stderr is not a terminal
 
 
 # Styles are marked with non-characters, so text from untrusted files cannot inject escape codes
-_MARKS = dict(zip(MARKS, (f"\033[{code}m" for code in ("1", "1;31", "0", "32", "33")), strict=True))
+_CODES = ("\033[1m", "\033[1;31m", "\033[0m", "\033[32m", "\033[33m")
+_MARKS = dict(zip(MARKS, _CODES, strict=True))
 BOLD, ALARM, _END, GOOD, DOUBT = _MARKS
 MEANING = {
     **dict.fromkeys(("better", "first", "effect", "several", "none", "converged"), GOOD),
@@ -193,6 +193,8 @@ def stages() -> Iterator[Callable[[str], None]]:
         last, began = "", time.monotonic()
         while not ended.wait(EVERY):
             if now:
+                from grounded.progress import duration  # seldom needed
+
                 taken = f", {duration(time.monotonic() - began)} so far"
                 text = f"{SO_FAR.sub('', now)}{taken}" if now == last else now
                 _write(f"{text} ...", sys.stderr)

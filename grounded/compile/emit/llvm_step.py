@@ -17,7 +17,7 @@ from functools import cached_property
 
 from grounded.compile.emit.llvm_graph import DT, Body, Uniforms
 from grounded.compile.emit.llvm_text import Writer, doubles, integers, number, splat
-from grounded.compile.problem import STAGES
+from grounded.compile.names import STAGES
 from grounded.compile.trace.graph import Graph
 from grounded.compile.trace.tracing import Trace
 

@@ -10,7 +10,7 @@ from grounded.compile.emit.llvm_rollout import rollout_kernel
 from grounded.compile.emit.llvm_step import dynamics_of, jacobian_function, stage_tables
 from grounded.compile.emit.llvm_text import declarations
 from grounded.compile.kernel_words import LANES, MAX_INPUTS, Layout
-from grounded.compile.problem import Integrator, Kind
+from grounded.compile.names import Integrator, Kind
 from grounded.compile.trace.tracing import Trace
 
 

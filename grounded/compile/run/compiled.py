@@ -36,14 +36,13 @@ from grounded.compile.kernel_words import (
     TURN,
     Layout,
 )
-from grounded.compile.names import Signature, where
+from grounded.compile.names import Integrator, Signature, where
 from grounded.compile.problem import (
     STATUSES,
     Backward,
     Controls,
     Descent,
     DescentOptions,
-    Integrator,
     Limits,
     Problem,
     Swarm,

@@ -31,20 +31,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from grounded.compile.names import Signature, raised_at, where
+from grounded.compile.names import Integrator, Signature, integrated, raised_at, where
 from grounded.compile.problem import (
     STOP,
     Backward,
     Controls,
     Descent,
     DescentOptions,
-    Integrator,
     Limits,
     Problem,
     Queue,
     Samples,
     Swarm,
-    integrated,
 )
 from grounded.frozen import Array, wrapped
 

@@ -22,4 +22,5 @@ class Entry(NamedTuple):
     hides: tuple[str, ...] = ()
 
 
-note, warn, aside, refuse = (partial(Entry, one) for one in ("note", "warn", "aside", "refuse"))
+note, warn = partial(Entry, "note"), partial(Entry, "warn")
+aside, refuse = partial(Entry, "aside"), partial(Entry, "refuse")

@@ -1,5 +1,7 @@
 """ingest: our own trials byte for byte, others through [log], each content once."""
 
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +39,29 @@ def plain(T=40, **changes):
         "input_names": ("force",),
     }
     return Trial(**fields | changes)
+
+
+PASSED = """
+import sys
+passed = set()
+def see(frame, event, arg):
+    code = frame.f_code
+    if event == "call" and "grounded" in code.co_filename and code.co_name != "<module>":
+        passed.add((code.co_filename, code.co_qualname, code.co_firstlineno))
+sys.setprofile(see)
+from grounded_trials import Workspace
+Workspace(sys.argv[1]).ingest(sys.argv[2])
+sys.setprofile(None)
+slow = [name for name in sys.modules if name.startswith(("grounded.compile.run", "grounded.solve"))]
+assert not slow, slow
+assert len(passed) <= 500 and len({file for file, *_ in passed}) <= 60, len(passed)
+"""
+
+
+def test_a_faultless_trial_of_ours_passes_a_short_way_and_nothing_is_compiled(w):
+    path = run(w)
+    done = subprocess.run([sys.executable, "-c", PASSED, w.folder, path], capture_output=True)
+    assert not done.returncode, done.stderr.decode()
 
 
 def test_a_trial_of_ours_is_stored_byte_for_byte(w):

@@ -146,11 +146,12 @@ def draw(workspace: Folder, asked: Manoeuvre) -> Drawn:
 
     # Its columns, those of a log know their own start; and the files.
     columns = _columns(workspace, asked, start)
+    extra: tuple[Any, ...] = ()
     rest = rest if asked.shape in SHAPES else {}
     line = asked.rest and asked.shape == "line"
-    ends, weights = rest_at_end(workspace, columns, start) if line else ({}, {})
-    columns = {**columns, **ends}
-    path = replace_target(workspace.config, columns, model, weights, [*ends])
+    if line and (rests := rest_at_end(workspace, columns, start)) is not None:
+        columns, extra = {**columns, **rests.columns}, (rests.weights, [*rests.columns])
+    path = replace_target(workspace.config, columns, model, *extra)
     if rest:
         set_keys(workspace.config.file, "task", start=rest)
     workspace.forget()

@@ -108,7 +108,7 @@ def read_candidate(
         state_names=tuple(states),
         input_names=tuple(inputs),
         depths=depths,
-        angles=tuple(bool(a) for a in own.floats(table.get("angles"), "policy.angles", n)),
+        angles=tuple(map(bool, own.floats(table.get("angles"), "policy.angles", n))),
         past=own.floats(table.get("past"), "policy.past", m),
         gain=gain.reshape(-1, m, nz) if gain.size else None,
         reference=reference if reference.size else None,
@@ -146,7 +146,8 @@ def _controls(policy: Policy) -> list[Array]:
 
 def _hash(table: Meta, arrays: Iterable[Array]) -> str:
     """Return the SHA-256 of the metadata (without `sha256`) and all numbers."""
-    known = {key: value for key, value in table.items() if key != "sha256"}
+    known = dict(table)
+    known.pop("sha256", None)
     digest = hashlib.sha256(json.dumps(known, sort_keys=True).encode())
     for array in arrays:
         digest.update(repr(array.shape).encode())
@@ -155,9 +156,9 @@ def _hash(table: Meta, arrays: Iterable[Array]) -> str:
 
 
 def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
-    if not all(d.is_integer() and 0 <= d <= WIDTH for d in depths.tolist()):
+    if not ((depths % 1 == 0) & (depths >= 0) & (depths <= WIDTH)).all():
         raise own.bad("policy.depths", depths.tolist(), must="whole", low=0, high=WIDTH)
-    return tuple(int(d) for d in depths)
+    return tuple(depths.astype(int).tolist())
 
 
 def _policy_table(policy: Policy) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -73,45 +74,44 @@ class OwnFile:
 
     def number(self, key: str) -> float:
         """Return a positive finite number from the metadata."""
-        return self._parsed(key, float, lambda v: 0 < v < math.inf, must="positive")
+        if 0 < (value := self._parsed(key, float, must="positive")) < math.inf:
+            return value
+        raise self.bad(key, self.meta[key], must="positive")
 
     def integer(self, key: str, *, signed: bool = False) -> int:
         """Return an integer of 64 bits from the metadata, not negative unless `signed`."""
         low = -(2**63) if signed else 0
-        return self._parsed(key, int, lambda v: low <= v < 2**63, must="whole")
+        if low <= (value := self._parsed(key, int, must="whole")) < 2**63:
+            return value
+        raise self.bad(key, self.meta[key], must="whole")
 
     def json(self, key: str, kind: type[list[Any] | dict[str, Any]]) -> Any:
         """Return a JSON list or object from the metadata."""
+        value = self._parsed(key, json.loads, type=kind.__name__)
+        if isinstance(value, kind) and len(value) <= NAME_LIMIT:
+            return value
+        raise self.bad(key, self.meta[key], type=kind.__name__)
 
-        def fits(value: Any) -> bool:
-            return isinstance(value, kind) and len(value) <= NAME_LIMIT
-
-        return self._parsed(key, json.loads, fits, type=kind.__name__)
-
-    def _parsed(
-        self, key: str, parse: Callable[[str], T], fits: Callable[[T], bool], **expected: Any
-    ) -> T:
+    def _parsed(self, key: str, parse: Callable[[str], T], **expected: Any) -> T:
         text = self.entry(key)
         try:
-            if fits(value := parse(text)):
-                return value
+            return parse(text)
         except (ValueError, RecursionError):
-            pass
-        raise self.bad(key, text, **expected)
+            raise self.bad(key, text, **expected) from None
 
     def names(self, key: str) -> list[str]:
         """Return the names of a JSON object of the metadata, in order."""
         table = self.json(key, dict)
-        if not table or not all(isinstance(unit, str) for unit in table.values()):
+        if {*map(type, table.values())} != {str}:
             raise self.bad(key, table, must="units")
         return list(table)
 
     def floats(self, value: Any, what: str, size: int, null: float | None = None) -> Array:
         """Return a JSON list of `size` numbers as an array; `null` replaces None."""
-        if isinstance(value, list) and len(value) == size:
-            numbers = [null if item is None else item for item in value]
-            if all(isinstance(item, int | float) for item in numbers):
-                return np.array(numbers, dtype=np.float64)
+        kinds = {int, float, bool} if null is None else {int, float, bool, type(None)}
+        if isinstance(value, list) and len(value) == size and {*map(type, value)} <= kinds:
+            given = np.array(value, dtype=object)
+            return np.where(given == None, np.nan if null is None else null, given).astype(float)  # noqa: E711
         raise self.bad(what, value, shape=f"({size},)")
 
     def doubles(self, topic: str, names: list[str]) -> Array:
@@ -131,27 +131,31 @@ class OwnFile:
             doubles = numbers_in(self.types[topic])
         except BadSchema as error:
             raise unreadable(where, error) from None
-        there = {name: number for name, (number, many) in doubles.items() if many is listed}
+        there = dict[str, int]()
+        for name, (number, many) in doubles.items():
+            if many is listed:
+                there[name] = number
         for name in sizes:
             if name not in there:
                 raise unknown("list" if listed else "number", name, there, where)
         if not batches:
             return [np.zeros((0, size)) for size in sizes.values()]
-        tag = doubles_tag if listed else lambda number, size: double_tag(number)
-        tags = [(tag(there[name], size), size) for name, size in sizes.items()]
+        tags = list[tuple[bytes, int]]()
+        for name, size in sizes.items():
+            tag = doubles_tag(there[name], size) if listed else double_tag(there[name])
+            tags.append((tag, size))
         # of an open-loop policy only the first list is there
         for some in (tags, tags[:1]) if listed else (tags,):
             read = [uniform_doubles(b.buffer, b.starts, b.ends, some) for b in batches]
-            uniform = [values for values in read if values is not None]
-            if len(uniform) == len(batches):
-                found = [np.concatenate(blocks) for blocks in zip(*uniform, strict=True)]
+            if None not in read:
+                found = [*map(np.concatenate, zip(*read, strict=True))]
                 return found + [np.zeros((0, size)) for _, size in tags[len(some) :]]
         raise unreadable(where, "messages that grounded did not write")
 
     def check_grid(self, topic: str, start_ns: int, dt: float) -> None:
         """Raise an error if a topic's sample k is over half a step away from start_ns + k dt."""
         batches = self.messages.get(topic, [])
-        stamps = np.concatenate([b.publish_times for b in batches] or [np.zeros(0, np.int64)])
+        stamps = np.concatenate([np.zeros(0, np.int64), *map(attrgetter("publish_times"), batches)])
         times = (stamps - start_ns) * 1e-9
         off = np.abs(times - dt * np.arange(len(times))) > 0.5 * dt
         if not off.any():
@@ -208,11 +212,15 @@ def read_own(source: str | Path | bytes, name: str, kind: str) -> OwnFile:
         raise unreadable(name, f"format {has}", kind=f"{kind} file")
     types = dict[str, Schema]()
     for topic in topics:
-        schema, encoding = topic.schema, topic.channel.encoding
-        if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
-            raise unreadable(f"{name}: {topic.name}", encoding)
-        types[topic.name] = schema
+        types[topic.name] = _type(topic, name)
     return OwnFile(name, source, meta, attachments, types, messages)
+
+
+def _type(topic: Topic, name: str) -> Schema:
+    schema, encoding = topic.schema, topic.channel.encoding
+    if encoding != "protobuf" or schema is None or schema.encoding != "protobuf":
+        raise unreadable(f"{name}: {topic.name}", encoding)
+    return schema
 
 
 def stated(

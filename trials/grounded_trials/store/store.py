@@ -131,7 +131,9 @@ class Store:
             try:
                 sweep(self.folder, age_s=0.0)  # the lock excludes running processes
                 entries = self.list()
-                same = next((e for e in entries if e.digest == digest[:DIGITS]), None)
+                same = None
+                for entry in reversed(entries):
+                    same = entry if entry.digest == digest[:DIGITS] else same
                 whole = same is not None and hash_file(same.path) == digest
                 if same is None or (again and whole):
                     number = entries[-1].number + 1 if entries else 1
@@ -227,10 +229,10 @@ def sweep(folder: Path, age_s: float = OLD_S) -> None:
     """Remove temporary files of killed processes, so long after their last write."""
     with os.scandir(folder) as entries:
         names = [e.name for e in entries if e.name[0] == "." and _TEMPORARY.search(e.name)]
-    for path in (folder / name for name in names):
+    for name in names:
         with suppress(OSError):
-            if path.lstat().st_mtime <= time.time() - age_s:
-                path.unlink()
+            if (folder / name).lstat().st_mtime <= time.time() - age_s:
+                (folder / name).unlink()
 
 
 def _place(data: bytes, path: Path, mode: int) -> None:

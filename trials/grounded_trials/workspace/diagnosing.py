@@ -88,7 +88,7 @@ def diagnose_in(
     used, others = share.trials, second.trials
     told = filter(None, [overtaken(workspace), share.finding, second.finding])
     memory = planner.plan.model.state_names[planner.task.model.n :]
-    rows, early = unsure_times(workspace, {one.id for one in (*used, *others)})
+    rows, early = unsure_times(workspace.whole_trials(), {one.id for one in (*used, *others)})
     options = DiagnosisOptions(
         library=library,
         max_effects=max_effects,

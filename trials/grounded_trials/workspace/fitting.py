@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from grounded.checks import refused
 from grounded.diagnosis.error_report import errors
 from grounded.effects import param_name
-from grounded.errors import NextCommand
+from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, settle
 from grounded.findings import found as finding
 from grounded.fit import fit
@@ -106,7 +105,7 @@ def fit_in(
     planner, share, names = workspace.planner, chosen(workspace, trials), params
     used, ids = share.trials, tuple(trial.id for trial in share.trials)
     adopted, every = _adopted_delays(workspace), tuple(range(planner.plan.model.m))
-    rows, early = unsure_times(workspace, ids)
+    rows, early = unsure_times(workspace.whole_trials(), ids)
     found = fit(
         planner.plan,
         [planner.lift(trial) for trial in used],
@@ -123,20 +122,14 @@ def fit_in(
     if share.finding is not None:
         found = replace(found, findings=(*found.findings, share.finding))
     seen = where_to_mend(workspace, used, found.preflight)
-    delays = (name for name in workspace.config.model.effects if name.startswith("delay:"))
-    exact = tuple(name for name in delays if param_name(name, "d") not in found.params)
-    kept = () if names or latency else exact
+    kept = () if names or latency else _taken_as_exact(workspace, found)
     asked: tuple[str, ...] = ("--params", ",".join(names)) if names else ()
     asked += ("--trials", ",".join(trials)) if trials else ()
     asked += ("--latency",) * latency
     fitted = partial(Fitted, found, preflight=seen, not_fitted=kept, trials=ids)
     fitted = partial(fitted, rows_s=rows * bool(late), interpolated_s=early)
     if apply and found.worse:
-        row = found.prediction_error[-1]
-        name = max(row.changes, key=lambda name: row.changes[name])  # the most affected state
-        ends = errors(row, name, now="with_effects", before="crude")
-        facts = {"state": name, "ahead": row.horizon_s, **ends}
-        raise refused("model.fit_worse", then=after_fit(workspace), **facts)
+        raise GroundedError(_worse(found), then=after_fit(workspace))
     if not apply:
         # parameters alone stand for what the last diagnosis has found beside them
         last = readable_diagnosis(workspace.reports)
@@ -181,6 +174,20 @@ def _adopted_delays(workspace: Folder) -> dict[str, tuple[int, ...]]:
         if np.allclose(plan.latency[list(inputs)], values["d"], rtol=0.0, atol=1e-9):
             found[param_name(effect, "d")] = inputs
     return found
+
+
+def _taken_as_exact(workspace: Folder, found: Fit) -> tuple[str, ...]:
+    """Return the adopted delays that were not fitted."""
+    delays = (name for name in workspace.config.model.effects if name.startswith("delay:"))
+    return tuple(name for name in delays if param_name(name, "d") not in found.params)
+
+
+def _worse(found: Fit) -> Finding:
+    """Return how much worse a fit predicts, with the most affected state."""
+    row = found.prediction_error[-1]
+    name = max(row.changes, key=lambda name: row.changes[name])
+    ends = errors(row, name, now="with_effects", before="crude")
+    return finding("model.fit_worse", state=name, ahead=row.horizon_s, **ends)
 
 
 def apply_fit(workspace: Folder, found: Fit) -> None:

@@ -151,9 +151,9 @@ class Folder:
             except GroundedError as error:
                 errors.append(error)
                 broken.append(Lost(str(stored.path), str(error)))
-        lost = (
-            replace(one, file=Path(one.file).name) for one in (*broken, *known.gone(self.store))
-        )
+        lost = list[Lost]()
+        for gone in (*broken, *known.gone(self.store)):
+            lost.append(replace(gone, file=Path(gone.file).name))
         return tuple(found), tuple(lost), errors
 
     @cached_property
@@ -182,8 +182,9 @@ class Folder:
 
     def forget(self) -> Self:
         """Forget everything that was read, since files may have changed; return the folder."""
-        for name in [n for n, kept in vars(Folder).items() if isinstance(kept, cached_property)]:
-            vars(self).pop(name, None)
+        for name, kept in vars(Folder).items():
+            if isinstance(kept, cached_property):
+                vars(self).pop(name, None)
         return self
 
     def forget_trials(self) -> None:
@@ -221,9 +222,11 @@ class Folder:
 
     def discarded(self) -> dict[str, str]:
         """Return the trials that are set aside, t0004 -> why."""
-        entries = self.store.list() if self.noted.aside else ()
-        found = {one.id: self.noted.why_aside(one) for one in entries}
-        return {name: why for name, why in found.items() if why is not None}
+        found = dict[str, str]()
+        for one in self.store.list() if self.noted.aside else ():
+            if (why := self.noted.why_aside(one)) is not None:
+                found[one.id] = why
+        return found
 
     def aside_trials(self) -> Iterator[StoredTrial]:
         """Yield the trials that are set aside and not damaged, with short gaps bridged."""
@@ -273,8 +276,9 @@ class Folder:
         found: set[str] = set()
         for place, first in (("trials", "t"), ("candidates", "c")):
             with suppress(FileNotFoundError):
-                names = os.listdir(self.folder / place)  # noqa: PTH208 (many times quicker)
-                found.update(name for name in names if name.startswith(first))
+                for name in os.listdir(self.folder / place):  # noqa: PTH208 (many times quicker)
+                    if name.startswith(first):
+                        found.add(name)
         return frozenset(found)
 
     def bring_back(self, identity: str) -> Path:
@@ -331,9 +335,9 @@ class Folder:
                 try:
                     data = read()
                     made, meta = candidate_of(data, identity)
-                    ran = (t for t in trials if t.trial.candidate == identity and t.ran)
-                    if trial := next((t for t in ran if t.ran != sha256(data)), None):
-                        raise refused("file.changed", file, what="policy", lost=trial.stored.id)
+                    for one in trials:
+                        if one.trial.candidate == identity and one.ran not in ("", sha256(data)):
+                            raise refused("file.changed", file, what="policy", lost=one.stored.id)
                 except GroundedError as error:
                     errors.append(why := error)
                     continue
@@ -347,10 +351,14 @@ class Folder:
                 lost.append(Lost(f"{identity}.mcap", str(why)))
 
     def _ids(self, trials: tuple[StoredTrial, ...]) -> list[str]:
-        ids = {t.trial.candidate for t in trials}
+        ids = set[str]()
+        for one in trials:
+            ids.add(one.trial.candidate)
         with suppress(FileNotFoundError), os.scandir(self.folder / "candidates") as entries:
-            ids |= {e.name[:-5] for e in entries if e.name.endswith(".mcap") and e.is_file()}
-        return sorted(filter(_ID.fullmatch, ids), key=lambda name: int(name[1:]))
+            for entry in entries:
+                if entry.name.endswith(".mcap") and entry.is_file():
+                    ids.add(entry.name[:-5])
+        return sorted(sorted(filter(_ID.fullmatch, ids)), key=len)  # by number
 
     def _sources(
         self, identity: str, trials: tuple[StoredTrial, ...] | None = None

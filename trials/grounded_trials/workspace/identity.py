@@ -97,10 +97,13 @@ class Noted:
 
     def gone(self, store: Store) -> Iterator[Lost]:
         """Yield the trials that were stored but are missing now."""
-        entries = store.list()
-        numbers = {stored.number for stored in entries}
+        numbers, lost = set[int](), self.last - {""}
+        for stored in store.list():
+            numbers.add(stored.number)
+            lost.discard(stored.path.stem)
         gaps = set(range(1, max(numbers, default=0))) - numbers
-        lost = self.last - {stored.path.stem for stored in entries} - {""}
+        if not (gaps or lost):
+            return
         names = {name.split("-")[0] for name in lost}
         names |= {f"{store.prefix}{number:04d}" for number in gaps}
         for name in sorted(names):
@@ -160,20 +163,30 @@ def encoded(candidate: Candidate, task: Task, kind: str) -> bytes:
 
 def candidate_of(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
     """Decode a candidate and its metadata from the bytes of its file."""
-    key, name = (sha256(data), identity), f"candidates/{identity}.mcap"
+    key = sha256(data), identity
     if key not in _DECODED:
-        try:
-            policy, states, inputs, meta = read_candidate(data, name)
-            about = {key: of((_ABSENT | meta)[key]) for key, of in _FIELDS.items() if key != "task"}
-        except (DamagedFile, KeyError, ValueError) as error:
-            raise unreadable(name, error, mend="candidate", then=NextCommand("propose")) from None
-        if about["id"] != identity:
-            raise refused("file.changed", name, what="name", lost=about["id"][:40])
-        about["units"] = json.loads(meta["states"]) | json.loads(meta["inputs"])
-        about |= {"policy": policy, "predicted_states": states, "predicted_inputs": inputs}
-        _DECODED[key] = Candidate(**about), meta
+        _DECODED[key] = _decoded(data, identity)
     candidate, meta = _DECODED[key]
     return candidate, dict(meta)
+
+
+def _decoded(data: bytes, identity: str) -> tuple[Candidate, dict[str, str]]:
+    name = f"candidates/{identity}.mcap"
+    try:
+        policy, states, inputs, meta = read_candidate(data, name)
+    except DamagedFile as error:
+        raise unreadable(name, error, mend="candidate", then=NextCommand("propose")) from None
+    try:
+        about, known = dict[str, Any](), _ABSENT | meta
+        for key, of in _FIELDS.items():
+            if key != "task":
+                about[key] = of(known[key])
+    except (KeyError, ValueError) as error:
+        raise unreadable(name, error, mend="candidate", then=NextCommand("propose")) from None
+    if about["id"] != identity:
+        raise refused("file.changed", name, what="name", lost=about["id"][:40])
+    about["units"] = json.loads(meta["states"]) | json.loads(meta["inputs"])
+    return Candidate(policy=policy, predicted_states=states, predicted_inputs=inputs, **about), meta
 
 
 def other_task(task: Task, made: Candidate) -> str:
@@ -181,11 +194,11 @@ def other_task(task: Task, made: Candidate) -> str:
     policy, model = made.policy, task.model
     if (policy.state_names, policy.input_names) != (model.state_names, model.input_names):
         return "another model"
-    ends = zip(model.input_names, policy.low, policy.high, task.low, task.high, strict=True)
+    own, now = np.stack([policy.low, policy.high], axis=1), np.stack([task.low, task.high], axis=1)
     told = [
         f"limits of {name}: [{low:g}, {high:g}] then"
-        for name, low, high, *now in ends
-        if not np.allclose((low, high), now)
+        for j, (name, (low, high)) in enumerate(zip(model.input_names, own, strict=True))
+        if not np.allclose(own[j], now[j])
     ]
     if policy.horizon != task.horizon:
         told.append(f"a horizon of {policy.horizon} steps then")
@@ -194,9 +207,9 @@ def other_task(task: Task, made: Candidate) -> str:
     return "; ".join(told) or "another target, reward or feedback"
 
 
-def unsure_times(workspace: Folder, trials: Collection[str]) -> tuple[float, float]:
+def unsure_times(stored: Iterable[StoredTrial], trials: Collection[str]) -> tuple[float, float]:
     """Return the largest `row_s` and `interpolated_s` of the logs of some trials, see `Gridded`."""
-    logs = [one.meta for one in workspace.whole_trials() if one.stored.id in trials]
+    logs = [one.meta for one in stored if one.stored.id in trials]
     rows, early = ([float(meta.get(key, 0.0)) for meta in logs] for key in (ROWS, INTERPOLATED))
     return max(rows, default=0.0), max(early, default=0.0)
 

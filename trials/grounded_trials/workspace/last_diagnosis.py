@@ -128,12 +128,12 @@ class Since:
         return not self.newer and (adopted or not self.changed)
 
     @property
-    def finding(self) -> Finding | None:
-        """Why the diagnosis is outdated; None if it is not."""
+    def findings(self) -> tuple[Finding, ...]:
+        """Why the diagnosis is outdated; () if it is not."""
         only = self.changed and not self.adopted
         if not (self.newer or self.adopted or only):
-            return None
-        return found(
+            return ()
+        one = found(
             "search.outdated",
             used=self.used if self.newer else None,
             usable=self.usable,
@@ -141,11 +141,12 @@ class Since:
             missing=self.missing,
             changed=int(only),
         )
+        return (one,)
 
     @property
     def sentence(self) -> str:
         """Why the diagnosis is outdated, in words; "" if it is not."""
-        return self.finding.sentence if self.finding else ""
+        return "; ".join(one.sentence for one in self.findings)
 
 
 def model_print(workspace: Folder) -> str:
@@ -158,10 +159,9 @@ def model_print(workspace: Folder) -> str:
 
 def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     """Return what changed in a workspace since a diagnosis was made; nothing without one."""
-    usable = usable_ids(workspace)
     if diagnosis is None:
-        return Since(usable=len(usable))
-    model, made = workspace.config.model, diagnosis.made
+        return Since()
+    model, made, usable = workspace.config.model, diagnosis.made, usable_ids(workspace)
     last = max((k for k, name in enumerate(usable) if name in made.trials), default=-1)
 
     # the effects of the model now, of those that it claims and of others
@@ -170,7 +170,8 @@ def since_diagnosis(workspace: Folder, diagnosis: Diagnosis | None) -> Since:
     adopted = [name for name in diagnosis.effects if name not in missing]
     known = {*made.effects, *diagnosis.effects}
     adopted += [name for name in model.effects if name not in known]
-    same = now == [*map(dict, made.adopted)] and made.params in (None, dict(model.params))
+    same = now == [*map(dict, made.adopted)]
+    same = same and made.params in (None, dict(model.params))
     return Since(
         used=sum(name in made.trials for name in usable),
         usable=len(usable),

@@ -73,10 +73,7 @@ def learn_in(
     """
     if trials is not None:
         whole_number("trials", trials, 0, MOST_TRIALS)
-    tell, done = progress or (lambda stage: None), 0
-    # after a run whose log had faults the user has chosen to go on
-    runs = [trial for trial in workspace.task_trials() if trial.candidate]
-    odd = bool(runs and Run(workspace, runs[-1]).log_faults())
+    tell, done, odd = progress or (lambda stage: None), 0, _odd_before(workspace)
     while trials is None or done < trials:
         tell("planning")
         proposed = propose_in(workspace)
@@ -96,6 +93,12 @@ def learn_in(
     status = status_of(workspace, standing_in(workspace))
     goes_on = status.standing.phase is Phase.PROPOSE
     return replace(status, then=NextCommand("learn")) if goes_on else status
+
+
+def _odd_before(workspace: Folder) -> bool:
+    """Return whether the last run's log had faults too, so that the user has chosen to go on."""
+    runs = [trial for trial in workspace.task_trials() if trial.candidate]
+    return bool(runs and Run(workspace, runs[-1]).log_faults())
 
 
 def next_in(

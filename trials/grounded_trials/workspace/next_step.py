@@ -16,11 +16,11 @@ from grounded.search.standing import LOST, Ending, Phase, Standing
 from grounded_trials.store.store import hash_file
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
-from grounded_trials.workspace.last_diagnosis import Since, readable_diagnosis, since_diagnosis
 from grounded_trials.workspace.new_target import PROPOSE, TARGET, to_plan, undrawn
 
 if TYPE_CHECKING:
     from grounded.diagnosis.parts import Diagnosis
+    from grounded_trials.workspace.last_diagnosis import Since
 
 DIAGNOSE, FIT = NextCommand("diagnose"), NextCommand("fit", ("--apply",))
 EXPORT = NextCommand("export", ("best", "--runner"))
@@ -70,12 +70,23 @@ class Situation:
     @cached_property
     def diagnosis(self) -> Diagnosis | None:
         """The last diagnosis, or None."""
+        from grounded_trials.workspace.last_diagnosis import readable_diagnosis
+
         return self.found or readable_diagnosis(self.workspace.reports)
 
     @cached_property
     def since(self) -> Since:
         """What changed since the diagnosis."""
+        from grounded_trials.workspace.last_diagnosis import since_diagnosis
+
         return since_diagnosis(self.workspace, self.diagnosis)
+
+    @cached_property
+    def usable(self) -> int:
+        """How many trials a diagnosis can use now."""
+        from grounded_trials.workspace.last_diagnosis import usable_ids
+
+        return self.since.usable if self.diagnosis else len(usable_ids(self.workspace))
 
     @property
     def then(self) -> NextCommand:
@@ -109,7 +120,7 @@ class Situation:
 
         A single run would confirm nothing.
         """
-        new = self.since.usable if self.diagnosis is None else self.since.newer
+        new = self.usable if self.diagnosis is None else self.since.newer
         return bool(self.now.doubt) and new >= LOST
 
     @property
@@ -157,7 +168,7 @@ NEXT: tuple[Row, ...] = (
     (
         ANY,
         lambda s: (
-            not (s.diagnosis or (s.now.history and s.now.phase is Phase.PROPOSE)) and s.since.usable
+            not s.diagnosis and s.usable and (not s.now.history or s.now.phase is not Phase.PROPOSE)
         ),
         lambda s: to_learn_from(s.workspace),
     ),

@@ -11,9 +11,11 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from grounded.findings import Finding, Quantity, found
 from grounded.frozen import Array
@@ -36,6 +38,7 @@ STILL_SHARE, HARDLY = 0.01, 1e-4
 RATE = 0.1  # weight of a velocity beside its position, relative to that of other states
 NARROW = 0.2  # smallest range used for a position's axis, as a fraction of the largest one
 UNKNOWN = 1.0  # range assumed for a constant column if no column of its unit moves
+DEAREST = itemgetter(1)
 REST = 0.1  # a target is at rest if its last step is below this fraction of its mean step
 
 
@@ -75,43 +78,52 @@ def off_target_of(task: Task, trials: Sequence[Trial]) -> tuple[OffTarget, ...]:
     That are the errors of the groups that matter most; () if nothing is tracked. Runs may end
     early, or have no known state at all.
     """
-    whole = [trial.whole(task.horizon) for trial in trials]
-    errors = [tracking_error(task, trial.until(max(trial.finite_steps, 0))) for trial in whole]
-    ended = any(len(e) <= task.horizon for e in errors)
-    found = dict[int, tuple[float, OffTarget]]()  # cost and errors of each group
-    for k, (names, what) in enumerate(weighed_groups(task)):
-        states = [task.model.state_names.index(name) for name in names]
-        each = [e[:, states] for e in errors]
-        if not all(np.isfinite(e).all() for e in each) or not each:
-            continue
-        running, terminal = task.reward.state[states], task.reward.terminal[states]
-        cost = sum(float((e**2 @ running).sum() + e[-1] ** 2 @ terminal) for e in each)
-        noise = [trial.noise(trial.finite_steps + 1)[states] for trial in whole]
-        values = {"noise": math.sqrt(np.mean(np.square(noise), axis=0).sum())}  # of a sample
-        size = np.abs(task.target[:, states]).max()  # that the errors are differences of
-        if running.any() or ended:
-            far = [np.linalg.norm(e, axis=1) for e in each]
-            worst = max(far, key=lambda d: float(d.max()))
-            values["rms"] = float(np.sqrt(np.mean(np.concatenate(far) ** 2)))
-            values |= {"most": float(worst.max()), "at_s": task.dt * int(np.argmax(worst))}
-        if (terminal.any() or reaches(task)) and not ended:
-            values["end"] = float(np.sqrt(np.mean([e[-1] @ e[-1] for e in each])))
-        values = {key: v if key == "at_s" else or_zero(v, size) for key, v in values.items()}
-        unit = task.model.states[names[0]]
-        found[k] = cost, OffTarget(what.removeprefix("the "), unit, **values)
-    units = [task.model.states[names[0]] for names, _ in weighed_groups(task)]
-    rates = {k for k, unit in enumerate(units) if any(unit == f"{other}/s" for other in units)}
-    told = sorted(found, key=lambda k: (k in rates, -found[k][0]))[:GROUPS_TOLD]
-    dear = max(found, key=lambda k: found[k][0], default=-1)
-    return tuple(one for k, (_, one) in found.items() if k in {*told, dear})
-
-
-def reaches(task: Task) -> bool:
-    """Return whether the task is to reach a point: its first weighed group is to end at rest."""
+    if not trials:
+        return ()
+    model, reward = task.model, task.reward
+    found, costs = list[OffTarget](), list[tuple[bool, float, int]]()
+    errors, at, noise = list[Array](), list[NDArray[np.intp]](), list[Array]()
+    for trial in trials:
+        run = trial.whole(task.horizon)
+        errors.append(tracking_error(task, run.until(max(run.finite_steps, 0))))
+        at.append(np.arange(len(errors[-1])))
+        noise.append(run.noise(run.finite_steps + 1))
+    every, step, shaken = (
+        np.concatenate(errors),
+        np.concatenate(at),
+        np.sqrt(np.mean(np.square(noise), axis=0)),
+    )
+    ends = every[np.append(step[1:] == 0, True)]  # the last state of each run
+    ended = len(every) < len(errors) * (task.horizon + 1)
     groups = weighed_groups(task)
-    if not groups:
-        return False
-    states = [task.model.state_names.index(name) for name in groups[0][0]]
+    units = {model.states[names[0]] for names, _ in groups}
+    for names, what in groups:
+        unit = model.states[names[0]]
+        states = np.isin(model.state_names, names)
+        far, end = np.linalg.norm(every[:, states], axis=1), ends[:, states]
+        if not np.isfinite(far).all():
+            continue
+        running, terminal = reward.state[states], reward.terminal[states]
+        cost = float((every[:, states] ** 2 @ running).sum() + (end**2 @ terminal).sum())
+        values = {"noise": float(np.linalg.norm(shaken[states]))}
+        if running.any() or ended:
+            values |= {"rms": float(np.sqrt(np.mean(far**2))), "most": float(far.max())}
+            values["at_s"] = task.dt * int(step[np.argmax(far)])
+        if (terminal.any() or reaches(task, groups)) and not ended:
+            values["end"] = float(np.sqrt((end**2).sum() / len(end)))
+        size = float(np.abs(task.target[:, states]).max())  # that the errors are differences of
+        for key in {*values} - {"at_s"}:
+            values[key] = or_zero(values[key], size)
+        rate = unit[-2:] == "/s" and unit[:-2] in units  # of another group
+        found.append(OffTarget(what.removeprefix("the "), unit, **values))
+        costs.append((rate, -cost, len(found) - 1))
+    told = {*sorted(costs)[:GROUPS_TOLD], *sorted(costs, key=DEAREST)[:1]}
+    return tuple(one for one, cost in zip(found, costs, strict=True) if cost in told)
+
+
+def reaches(task: Task, groups: Sequence[tuple[list[str], str]]) -> bool:
+    """Return whether the task is to reach a point: its first weighed group is to end at rest."""
+    states = np.isin(task.model.state_names, groups[0][0])
     way = task.model.difference(np.vstack([task.start, task.target]), task.start)[:, states]
     steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
     return bool(steps.any() and steps[-1] <= REST * steps.mean())
@@ -122,13 +134,16 @@ def weighed_groups(task: Task) -> list[tuple[list[str], str]]:
 
     The axes of a position form one group, which comes first.
     """
-    names, known, reward = task.model.state_names, set(tracked(task)), task.reward
-    weighed = [i for i in sorted(known) if reward.state[i] or reward.terminal[i]]
-    position = [i for i in position_axes(task.model) if i in known]
-    if len(position) < 2:
-        position = []
-    found = [([names[i] for i in position], "the position")] if position else []
-    return found + [([names[i]], names[i]) for i in weighed if i not in position]
+    names, known = task.model.state_names, np.asarray(np.isfinite(task.target).all(axis=0))
+    weighed = known & ((task.reward.state != 0) | (task.reward.terminal != 0))
+    axes, found = np.array(position_axes(task.model), int), list[tuple[list[str], str]]()
+    axes = axes[known[axes]]
+    if len(axes) > 1:
+        found.append((np.array(names)[axes].tolist(), "the position"))
+        weighed[axes] = False
+    for i in np.flatnonzero(weighed):
+        found.append(([names[i]], names[i]))
+    return found
 
 
 def position_axes(model: Model) -> list[int]:
@@ -137,8 +152,8 @@ def position_axes(model: Model) -> list[int]:
     axes = roles.get("position", [])[:3]
     if len(axes) < 2:
         return []
-    up = [i for i in roles.get("altitude", []) if i not in axes]  # (x, z) may have it already
-    return axes + up[: 3 - len(axes)]
+    up = roles.get("altitude", [])  # (x, z) may have it already
+    return axes + up[: 3 - len(axes)] if {*up}.isdisjoint(axes) else axes
 
 
 def position_names(model: Model) -> list[str]:
@@ -204,11 +219,11 @@ def driven(model: Model, columns: Mapping[str, Array], dt: float) -> tuple[float
 
 def roles_of(model: Model) -> dict[str, list[int]]:
     """Return the indices of the states in each role of the model."""
-    index = {name: i for i, name in enumerate(model.state_names)}
-    return {
-        role: [index[n] for n in ((names,) if isinstance(names, str) else names) if n in index]
-        for role, names in model.roles.items()
-    }
+    found = dict[str, list[int]]()
+    for role, names in model.roles.items():
+        some = (names,) if isinstance(names, str) else names
+        found[role] = [*map(model.state_names.index, filter(model.states.__contains__, some))]
+    return found
 
 
 def tracked(task: Task) -> list[int]:

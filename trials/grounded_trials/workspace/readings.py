@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from grounded.findings import Finding as Said
 from grounded.findings import found as said
@@ -37,12 +37,21 @@ UNCHANGED = Reading()
 SENSOR_DELAY = "sensor_delay:"  # before the states, in the name of an effect
 
 
+def readings(mapping: LogMapping | None) -> dict[str, Reading]:
+    """Return how [log] reads each signal; {} without [log]."""
+    found = {**mapping.states, **mapping.inputs} if mapping else {}
+    return {
+        name: Reading(spec.path, *(float(getattr(spec, key)) for key in NUMBERS))
+        for name, spec in found.items()
+    }
+
+
 def read_by(mapping: LogMapping) -> dict[str, str]:
     """Return the metadata of a trial with how [log] reads each signal, as far as it changes it."""
-    found = dict[str, Any]()
-    for name, spec in {**mapping.states, **mapping.inputs}.items():
-        own = {key: getattr(spec, key) for key in vars(UNCHANGED)}
-        found[name] = {k: v for k, v in own.items() if k == "path" or v != getattr(UNCHANGED, k)}
+    found = {
+        name: {k: v for k, v in vars(one).items() if k == "path" or v != getattr(UNCHANGED, k)}
+        for name, one in readings(mapping).items()
+    }
     return {READ_BY: json.dumps(found)}
 
 
@@ -88,8 +97,7 @@ def taken_out(workspace: Folder) -> dict[str, float]:
 
     A delay_s that the trials were read with is another part of the delay.
     """
-    mapping = workspace.log_mapping
-    log = {**mapping.states, **mapping.inputs} if mapping else {}
+    log = readings(workspace.log_mapping)
     metas = [one.meta for one in workspace.whole_trials() if READ_BY in one.meta] if log else []
     before = readings_of(metas[-1]) if metas else {}
     return {n: one.delay_s - before.get(n, UNCHANGED).delay_s for n, one in log.items()}

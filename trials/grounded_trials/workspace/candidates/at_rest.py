@@ -171,19 +171,26 @@ def _rest_of(workspace: Folder, stand: Stand) -> dict[str, float]:
 NOISY = 0.02  # most utility that the noise of a state may cost at the end, by its weight
 
 
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """What makes the free states of a line rest at its end."""
+
+    columns: dict[str, Array]  # of these and their rates, (H + 1,); they count at the end only
+    # for [reward] terminal, also of the line's states: a fast ball leaves a level beam as well
+    weights: dict[str, float]
+
+
 def rest_at_end(
     workspace: Folder, columns: Mapping[str, Array], start: Mapping[str, float]
-) -> tuple[dict[str, Array], dict[str, float]]:
-    """Return columns (H + 1,) and [reward] terminal weights by which a line's free states rest.
+) -> Rest | None:
+    """Return columns and weights for the free states of a line; None if it leaves none free.
 
-    These are the states that have a rate, with it; if none has one, the first. They rest at 0, and
-    count at the end only. The line's own states have a weight there, too: a fast ball leaves a
-    level beam as well. Both are empty if it leaves no state free.
+    These are the states that have a rate, with it; if none has one, the first. They rest at 0.
     """
     model = workspace.base_model
     rates, free = rate_states(model), [name for name in model.states if name not in columns]
     if not free:
-        return {}, {}
+        return None
     rows, found, ranges = len(next(iter(columns.values()))), dict[str, Array](), {}
     for name in [name for name in free if name in rates] or free[:1]:
         begins = start.get(name, 0.0)
@@ -197,4 +204,4 @@ def rest_at_end(
     for name, noise in zip(model.state_names, each.tolist(), strict=True):
         if name in found and weights[name] * noise**2 > NOISY:
             weights[name] = NOISY / noise**2
-    return found, {name: float(f"{w:.6g}") for name, w in weights.items()}
+    return Rest(found, {name: float(f"{w:.6g}") for name, w in weights.items()})

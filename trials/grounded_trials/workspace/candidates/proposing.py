@@ -155,16 +155,24 @@ def propose_in(workspace: Folder, tick: Callable[[str], None] | None = None) -> 
         from grounded_trials.workspace.candidates.first_plan import left_open  # not for `status`
 
         notes += left_open(workspace, candidate)
-    if now.doubt and Situation(workspace, now).doubted:
+    status = status_of(workspace, now)
+    if now.doubt and Situation(workspace, now, status.diagnosis).doubted:
         notes.append(now.doubt)
-    if candidate is not None:
-        return _told(workspace, proposal, notes)
+    if candidate is None:
+        return _ended(workspace, proposal, status, notes)
+    return _told(workspace, proposal, notes)
 
-    # There is nothing to run.
-    status, best = status_of(workspace, now), now.incumbent
-    converged = status.standing.phase is Phase.CONVERGED
+
+def _ended(
+    workspace: Folder,
+    proposal: Proposal,
+    status: Status,
+    notes: Sequence[Finding],
+) -> Proposed:
+    """Return that there is nothing to run."""
+    best, converged = proposal.standing.incumbent, status.standing.phase is Phase.CONVERGED
     if best and converged and best.candidate.model != workspace.planner.fingerprint:
-        notes.append(found("plan.no_better", best.candidate.id))
+        notes = [*notes, found("plan.no_better", best.candidate.id)]
     over = replace(proposal, standing=status.standing)
     return Proposed(over, None, status.then, settle((*proposal.findings, *notes)))
 
@@ -249,31 +257,35 @@ def status_of(workspace: Folder, standing: Standing, notes: Sequence[Finding] = 
     asked = asked_about(workspace)
     every = [
         *notes,
-        asked[1] if asked else None,
+        *([asked[1]] if asked else []),
         *gone,
-        overtaken(workspace),
+        *filter(None, [overtaken(workspace)]),
         *uncounted(workspace, standing),
         *left_out(workspace),
-        here.since.finding,
+        *here.since.findings,
     ]
-    best, model = standing.incumbent, workspace.config.model
-    adopted: tuple[tuple[str, str], ...] = ()
-    if model.effects or model.params:
-        from grounded_trials.workspace.adoption import adopted_rows  # slow
-
-        adopted = adopted_rows(workspace)
+    best = standing.incumbent
     return Status(
         standing,
         then,
-        settle(one for one in every if one),
+        settle(every),
         _certainty(standing),
         workspace.discarded(),
         off_target_of(workspace.task, best.trials if best else ()),
         last,
         here.since if last else None,
-        adopted,
+        _adopted(workspace),
         much_noise(best.noise_cost, best.utility) if best else None,
     )
+
+
+def _adopted(workspace: Folder) -> tuple[tuple[str, str], ...]:
+    """Return what was adopted, without slow imports if nothing was."""
+    if not (workspace.config.model.effects or workspace.config.model.params):
+        return ()
+    from grounded_trials.workspace.adoption import adopted_rows
+
+    return adopted_rows(workspace)
 
 
 def _certainty(now: Standing) -> tuple[Finding, ...]:

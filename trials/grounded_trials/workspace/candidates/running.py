@@ -70,10 +70,7 @@ def run_candidate(
     if warn is not None:
         for reason in handed.overridden:
             warn(found("plan.refused", identity, why=reason.sentence, anyway=True))
-    runs = made_folder(workspace.folder / "runs")
-    taken = [p.stem.rsplit("-", 1)[-1] for p in runs.glob(f"{identity}-*.mcap")]
-    number = max((int(t) for t in taken if t.isdigit()), default=0) + 1
-    path = runs / f"{identity}-{number}.mcap"
+    path = _next_run(workspace.folder / "runs", identity)
     if system.command:
         _call(workspace, system.command, handed, path)
     elif system.model:
@@ -102,6 +99,12 @@ def simulated_plant(workspace: Folder) -> Plant:
             f"latency and substeps in {system.model}", got=str(error), must="plant"
         ) from None
     return Plant(model=model, latency=latency, noise=noise, substeps=substeps)
+
+
+def _next_run(folder: Path, identity: str) -> Path:
+    taken = [p.stem.rsplit("-", 1)[-1] for p in made_folder(folder).glob(f"{identity}-*.mcap")]
+    number = max((int(t) for t in taken if t.isdigit()), default=0) + 1
+    return folder / f"{identity}-{number}.mcap"
 
 
 def _call(workspace: Folder, command: str, handed: Handed, path: Path) -> None:

@@ -23,6 +23,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding, Weight, found
 from grounded.search.planner import model_fingerprint
 from grounded.search.standing import Ending, Phase, Proposal, Standing, ended, standing
+from grounded.trial import Trial
 from grounded_trials.workspace.folder import Contents, Folder
 from grounded_trials.workspace.identity import StoredTrial, other_task
 
@@ -54,8 +55,10 @@ def standing_of(workspace: Folder, contents: Contents, without: Collection[str] 
     """Return the standing of the search by what a folder holds, without some trials."""
     task, options = workspace.task, workspace.config.search
     if (key := frozenset(without)) not in contents.standings:
-        trials = [t.trial for t in contents.trials if workspace.fits(t.trial)]
-        trials = [trial for trial in trials if trial.id not in without]
+        trials = list[Trial]()
+        for one in contents.trials:
+            if one.trial.id not in key and workspace.fits(one.trial):
+                trials.append(one.trial)
         known = (task, contents.candidates, trials, options)
         contents.standings[key] = standing(*known, workspace.planner.fingerprint)
     return contents.standings[key]
@@ -183,7 +186,7 @@ def overtaken(workspace: Folder, *, ran: bool = False) -> Finding | None:
     A candidate that was not run is void then. If it was run, its prediction is outdated, which
     matters where one is used or replaced: nothing is told of it without `ran`.
     """
-    trials = workspace.whole_trials()
+    ran_by = {one.trial.candidate for one in workspace.whole_trials()}
     for name in reversed(workspace.candidate_ids()):
         with suppress(GroundedError):  # a damaged file is named elsewhere
             made, meta = workspace.candidate(name)
@@ -191,7 +194,7 @@ def overtaken(workspace: Folder, *, ran: bool = False) -> Finding | None:
                 continue
             other = meta.get("task") != workspace.task.hash
             changed = not other and made.model != workspace.planner.fingerprint
-            if any(one.trial.candidate == name for one in trials):
+            if name in ran_by:
                 return found("plan.outdated", name, candidate=name) if changed and ran else None
             why = other_task(workspace.task, made) if other else MODEL
             void = found("plan.void", name, candidate=name, why=why, other=int(other))

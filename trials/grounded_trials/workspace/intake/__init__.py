@@ -12,5 +12,8 @@ opening/    reading a file, a trial written by grounded or any other log through
 How a run's commands may have come about is one table, in `grounded.accounts.returned`.
 """
 
-KINDS = "unit sign compass exchange dead offset axes pace clock"
-COLUMNS = tuple(f"log.{kind}" for kind in KINDS.split())  # faults that are mended in [log]
+# faults that are mended in [log]
+COLUMNS = (
+    *("log.unit", "log.sign", "log.compass", "log.exchange", "log.dead"),
+    *("log.offset", "log.axes", "log.pace", "log.clock"),
+)

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
@@ -27,18 +28,20 @@ from grounded.result import NULL, UNSAID, Document, with_unit
 from grounded.search.candidate import Candidate
 from grounded.task import Task
 from grounded.trial import HUGE, Trial
+from grounded_trials.logs.log_paths import log_files, on_disk
 from grounded_trials.store.own_files import CANDIDATE, TRIAL, format_of
 from grounded_trials.store.store import DIGITS, Added
 from grounded_trials.workspace.candidates.search_state import (
     candidate_named,
     overtaken,
+    standing_in,
     standing_of,
 )
 from grounded_trials.workspace.folder import Folder
+from grounded_trials.workspace.identity import sha256
 from grounded_trials.workspace.intake import COLUMNS
 from grounded_trials.workspace.intake.gone_wrong import Run
 from grounded_trials.workspace.intake.opening.reading import Read, read_own_trial
-from grounded_trials.workspace.intake.opening.stored_before import as_stored, repeated
 from grounded_trials.workspace.new_target import PROPOSE
 from grounded_trials.workspace.next_step import ASIDE, after_log
 from grounded_trials.workspace.off_target import OffTarget, off_target_of
@@ -81,17 +84,20 @@ class Ingested(Document):
     @property
     def warnings(self) -> tuple[str, ...]:
         """The sentences of the findings that may change what a person does."""
-        return tuple(one.sentence for one in self.findings if one.weight is not Weight.NOTE)
+        return self._sentences(lambda one: one.weight is not Weight.NOTE)
 
     @property
     def notes(self) -> tuple[str, ...]:
         """The sentences of the others."""
-        return tuple(one.sentence for one in self.findings if one.weight is Weight.NOTE)
+        return self._sentences(lambda one: one.weight is Weight.NOTE)
 
     @property
     def faults(self) -> tuple[str, ...]:
         """The sentences of those that say that columns of the log are wrong."""
-        return tuple(one.sentence for one in self.findings if one.code in FAULTS)
+        return self._sentences(lambda one: one.code in FAULTS)
+
+    def _sentences(self, which: Callable[[Finding], bool]) -> tuple[str, ...]:
+        return tuple(one.sentence for one in self.findings if which(one)) if self.findings else ()
 
     def summary(self) -> str:
         """Return the trial, what it ran and the verdict."""
@@ -128,8 +134,10 @@ def ingest_log(
 
         read = recognised(workspace, path, read, candidate)
     if read.log and read.log.stored:
+        from grounded_trials.workspace.intake.opening.stored_before import as_stored
+
         read = replace(read, data=as_stored(workspace, read.log, read.trial, read.data))
-    before = repeated(workspace, path, read.trial, read.data)
+    before = _repeated(workspace, path, read.trial, read.data)
     with ExitStack() as new:  # nothing is stored if judging the trial fails
         added = new.enter_context(workspace.store.adding(read.data, again=before != ""))
         if group:
@@ -137,6 +145,27 @@ def ingest_log(
             new.enter_context(workspace.notes.adding(note, again=True))
         workspace.forget_trials()
         return _judged(workspace, read, added, before)
+
+
+def _repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
+    """Return the stored trial that a new run repeats to the last bit, or "".
+
+    The same bytes count as a new run, not as the old one ingested twice, if that candidate is
+    outstanding and the file was written after the stored one.
+    """
+    digest = sha256(data)
+    known = None
+    for one in workspace.store.list():
+        known = one if digest.startswith(one.digest) else known
+    if known is None or not trial.candidate:
+        return ""
+    waiting = standing_in(workspace).outstanding
+    written = 0
+    for file in log_files(path):
+        for part in on_disk(file):
+            written = max(written, part.stat().st_mtime_ns)
+    fresh = written > known.path.stat().st_mtime_ns
+    return known.id if fresh and waiting and waiting.id == trial.candidate else ""
 
 
 def _judged(workspace: Folder, read: Read, added: Added, before: str) -> Ingested:
@@ -147,8 +176,8 @@ def _judged(workspace: Folder, read: Read, added: Added, before: str) -> Ingeste
     told += _checked(run)
     told += filter(None, run.shown(own=read.own, doubted=read.doubted))
     findings = settle(told)
-    why = next((one for one in findings if one.weight is Weight.ASIDE and not aside), None)
-    if why:  # `status` asks again
+    why = next((one for one in findings if one.weight is Weight.ASIDE), None) if findings else None
+    if why := None if aside else why:  # `status` asks again
         said = json.dumps(why.to_json())
         workspace.note(note="asked", trial=added.sha256[:DIGITS], finding=said)
     verdict, tried = ASIDE if aside else _verdict(run), run.tried
@@ -187,7 +216,7 @@ def _verdict(run: Run) -> str:
     tried, workspace, own = run.tried, run.workspace, run.trial.id
     if tried is None:
         return "probe" if run.trial.candidate else ""
-    first = [one.id for one in tried.trials[: workspace.config.search.repeats]]
+    first = map(attrgetter("id"), tried.trials[: workspace.config.search.repeats])
     if own in first or tried.accepted is None or tried.crashed:
         return tried.verdict()
     before, ran = standing_of(workspace, workspace.read(), {own}), tried.candidate.id

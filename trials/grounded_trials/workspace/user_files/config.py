@@ -8,7 +8,7 @@ which keeps the user's comments and layout.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +91,7 @@ class Config:
 def read_config(folder: Path) -> Config:
     """Read and check the workspace's grounded.toml."""
     table = read_toml(folder / FILE)
-    table.expect(one.name for one in fields(Config) if one.name not in ("file", "seen_in"))
+    table.expect({*Config.__annotations__} - {"file", "seen_in"})
     limits = table.sub("limits")
     seen_in = limits.take("seen_in", str, "")
     limits.values.pop("seen_in", None)
@@ -136,9 +136,10 @@ def _search(table: Table) -> SearchOptions:
 def _system(table: Table) -> SystemTable:
     noise = table.sub("noise")
     noise.expect(NOISES)
-    kinds = {kind: noise.sub(kind).numbers() for kind in NOISES}
-    for kind, values in kinds.items():
-        for name, std in values.items():
+    kinds = dict[str, Mapping[str, float]]()
+    for kind in NOISES:
+        kinds[kind] = noise.sub(kind).numbers()
+        for name, std in kinds[kind].items():
             if std < 0:
                 raise noise.sub(kind).error(name, "natural", std)
     found = table.into(SystemTable, noise=kinds)
@@ -177,7 +178,7 @@ def as_toml(value: Any) -> Any:
     return value
 
 
-def set_keys(file: Path, table: str, /, **values: Any) -> None:
+def set_keys(file: Path, table: str, **values: Any) -> None:
     """Replace keys in a table of grounded.toml; the rest of the file is unchanged.
 
     A value of None leaves the old one, an empty one removes the key.

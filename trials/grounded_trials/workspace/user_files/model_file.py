@@ -39,8 +39,11 @@ def load_module(
         raise wrong(f"grounded.toml: {key}", file, must="inside")
     if not path.is_file():
         raise refused("file.missing", path, where=f"grounded.toml: {key}")
-    between = [place for place in path.parents if place.is_relative_to(folder.resolve())]
-    check_own(folder, [folder / FILE, path, path.parent / "__pycache__", *between])
+    executed = [folder / FILE, path, path.parent / "__pycache__"]
+    for place in path.parents:
+        if place.is_relative_to(folder.resolve()):
+            executed.append(place)
+    check_own(folder, executed)
     spec = importlib.util.spec_from_file_location(f"grounded_workspace_{path.stem}", path)
     assert spec is not None and spec.loader is not None
     found = importlib.util.module_from_spec(spec)

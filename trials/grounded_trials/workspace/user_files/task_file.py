@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from io import TextIOWrapper
 from pathlib import Path
@@ -22,6 +22,7 @@ from grounded.task import MAX_HORIZON, Task
 from grounded.utility import Reward
 from grounded_trials.plain_file import open_file, unreadable
 from grounded_trials.store.store import write_atomically
+from grounded_trials.toml_table import Table
 from grounded_trials.workspace.user_files.config import Config
 
 
@@ -52,14 +53,12 @@ def _build(config: Config, model: Model, folder: Path) -> Task:
     else:
         target, input_target = np.full((table.horizon + 1, len(states)), np.nan), None
     first = np.where(np.isfinite(target[0]), target[0], 0.0)
-    start = np.array([table.start.get(s, first[i]) for i, s in enumerate(states)])
-    limits, safety = config.limits.pairs(inputs), config.safety.pairs(states)
-    free = (-np.inf, np.inf)
-    low, high = np.array([limits.get(name, free) for name in inputs]).T
-    safe_low, safe_high = np.array([safety.get(name, free) for name in states]).T
+    start = _by_name(table.start, states, first)
+    low, high = _ends(config.limits, inputs)
+    safe_low, safe_high = _ends(config.safety, states)
     held = np.zeros(len(inputs)) if input_target is None else input_target[0]
     aimed = np.clip(held, low, high)  # default of the input held before a run
-    past = np.array([table.start.get(name, aimed[i]) for i, name in enumerate(inputs)])
+    past = _by_name(table.start, inputs, aimed)
     return Task(
         model=model,
         dt=table.dt,
@@ -70,12 +69,29 @@ def _build(config: Config, model: Model, folder: Path) -> Task:
         low=low,
         high=high,
         feedback=table.feedback,
-        latency=np.array([table.latency.get(name, 0.0) for name in inputs]),
+        latency=_by_name(table.latency, inputs, np.zeros(len(inputs))),
         input_target=input_target,
         safety_low=safe_low,
         safety_high=safe_high,
         smoothing=config.model.smoothing,
     )
+
+
+def _by_name(given: Mapping[str, float], names: list[str], others: Array) -> Array:
+    """Return a value for each name, of those that are given or of the others."""
+    found = np.array(others, float)
+    for name, value in given.items():
+        if name in names:
+            found[names.index(name)] = value
+    return found
+
+
+def _ends(table: Table, names: list[str]) -> tuple[Array, Array]:
+    """Return the lower and upper limits of each name; infinite where none is given."""
+    low, high = np.full(len(names), -np.inf), np.full(len(names), np.inf)
+    for name, ends in table.pairs(names).items():
+        low[names.index(name)], high[names.index(name)] = ends
+    return low, high
 
 
 def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
@@ -84,8 +100,7 @@ def _reward(config: Config, states: list[str], inputs: list[str]) -> Reward:
     table.expect(kinds)
     weights = {}
     for kind, names in kinds.items():
-        given = table.sub(kind).numbers(names)
-        weights[kind] = np.array([given.get(name, 0.0) for name in names])
+        weights[kind] = _by_name(table.sub(kind).numbers(names), names, np.zeros(len(names)))
     reward = Reward(**weights)
     if not config.task.target:  # nothing to follow: weights on errors have no meaning
         none = np.zeros(len(states))
@@ -110,24 +125,22 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
     try:
         with TextIOWrapper(open_file(path), encoding="utf-8-sig", newline="") as stream:
             reader = csv.reader(stream)
-            names = [name.strip() for name in next(reader, [])]
+            names = [*map(str.strip, next(reader, []))]
             if not names:
                 raise refused("file.rows", path.name, rows="no", needs=2, target=1, then=SHAPE)
             one_of(f"the first column of {path.name}", names[0], ["t"])
-            if twice := [name for name in names if names.count(name) > 1]:
-                raise refused("given.twice", path.name, name=twice[0])
+            if len({*names}) < len(names):
+                raise refused("given.twice", path.name, name=max(names, key=names.count))
             rows: list[list[float]] = []
             for line, row in enumerate(reader, start=2):
                 if len(rows) > ROW_LIMIT:
                     raise unreadable(path.name, f"> {ROW_LIMIT} rows")
-                if not any(cell.strip() for cell in row):
+                if not "".join(row).strip():
                     continue
                 if len(row) != len(names):
                     sizes = {"line": line, "has": len(row), "names": len(names)}
                     raise refused("file.row", path.name, **sizes)
-                where = f"{path.name} line {line}"
-                cells = zip(names, row, strict=True)
-                rows.append([_number(f"{where}: '{n}'", cell, n in free) for n, cell in cells])
+                rows.append(_numbers(f"{path.name} line {line}", names, row, free))
     except FileNotFoundError:
         raise refused("file.missing", path, where="[task] target") from None
     except IsADirectoryError:
@@ -137,14 +150,16 @@ def read_target(path: Path, free: Collection[str] = ()) -> tuple[list[str], Arra
     return names, np.array(rows, dtype=float).reshape(len(rows), len(names))
 
 
-def _number(what: str, cell: str, may_be_free: bool) -> float:
-    try:
-        value = float(cell)
-    except ValueError:
-        raise wrong(what, cell, must="number") from None
-    if not (may_be_free or math.isfinite(value)):
-        raise wrong(what, cell, must="finite", do="omit")
-    return value
+def _numbers(where: str, names: list[str], row: list[str], free: Collection[str]) -> list[float]:
+    found = list[float]()
+    for name, cell in zip(names, row, strict=True):
+        try:
+            found.append(float(cell))
+        except ValueError:
+            raise wrong(f"{where}: '{name}'", cell, must="number") from None
+        if not (name in free or math.isfinite(found[-1])):
+            raise wrong(f"{where}: '{name}'", cell, must="finite", do="omit")
+    return found
 
 
 def target_arrays(
@@ -165,10 +180,10 @@ def target_arrays(
         facts = {"each": each, "sample": f"of line {i + 2}", "at": t[i], "expected": at[i]}
         then = NextCommand("target", (str(path),))
         raise refused("file.grid", path.name, then=then, dt=dt, **facts)
-    given = {name: values[: horizon + 1, names.index(name)] for name in names[1:]}
+    given = dict(zip(names[1:], values[: horizon + 1, 1:].T, strict=True))
     nothing = np.full(horizon + 1, np.nan)
     target = np.stack([given.get(name, nothing) for name in states], axis=1)
-    if not any(name in given for name in inputs):
+    if given.keys().isdisjoint(inputs):
         return target, None
     columns = [given.get(name, np.zeros(horizon + 1))[:horizon] for name in inputs]
     return target, np.stack(columns, axis=1)

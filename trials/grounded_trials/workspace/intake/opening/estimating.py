@@ -57,11 +57,7 @@ class EstimateTable:
 
 
 def read_estimate(table: Table, model: Model) -> EstimateTable:
-    """Read and check the [estimate] table; measured states are in the model's order.
-
-    Raises:
-        GroundedError: for an unknown state, or a standard deviation that is not positive.
-    """
+    """Read and check the [estimate] table; measured states are in the model's order."""
     table.expect(("measured", "process"))
     measured = table.sub("measured").numbers(model.state_names)
     process = table.sub("process").numbers(model.state_names)
@@ -82,15 +78,8 @@ def with_estimates(
 ) -> dict[str, Series]:
     """Add estimates of the states that are not measured to a log's signals.
 
-    Args:
-        series: the samples of every measured state and every input, in any order.
-        table: the measured states and the noise.
-        task: the task with the model, its latency and the control step.
-        asked: states to estimate; None: all of the model's. Pass names to leave out the memory
-            states of effects, which are not signals.
-
-    Raises:
-        GroundedError: for unusable samples, or if the smoother fails.
+    All of the model's, or those `asked` for, without the memory states of effects, which are no
+    signals. Unusable samples, or a smoother that fails, are an error.
     """
     model = task.model
     guessed = [name for name in asked or model.state_names if name not in table.measured]

@@ -73,12 +73,8 @@ class ForeignLog:
     def cut(self, candidate: str, start: float | None = None) -> tuple[Trial, Gridded]:
         """Cut the trial from the log; also return how it was sampled.
 
-        Args:
-            candidate: the candidate that it ran; "" for data, which may be longer than the task.
-            start: where it begins, seconds after the log's first sample; None: as in [log.span].
-
-        Raises:
-            GroundedError: if the log contains no complete trial.
+        It begins `start` seconds after the log's first sample, None: as in [log.span]. Data ("")
+        may be longer than the task.
         """
         model, task = self.workspace.base_model, self.workspace.config.task
         past = {n: s.before for n, s in self.mapping.inputs.items() if s.before is not None}
@@ -175,11 +171,7 @@ class ForeignLog:
 
 
 def mapping_of(workspace: Folder, path: Path) -> LogMapping:
-    """Return the [log] table, for this log.
-
-    Raises:
-        GroundedError: if there is no [log] table, or the file is not a log.
-    """
+    """Return the [log] table, for this log; an error if there is none, or the file is no log."""
     model, files = workspace.base_model, log_files(path)
     mapping = log_mapping(workspace.config.log, model.state_names, model.input_names)
     if mapping is not None:
@@ -197,11 +189,7 @@ def _first_records(files: tuple[Path, ...]) -> None:
 
 
 def read_foreign(workspace: Folder, path: Path, mapping: LogMapping) -> ForeignLog:
-    """Read a log through the [log] table.
-
-    Raises:
-        GroundedError: if a state or an input is not mapped, or the log can't be read.
-    """
+    """Read a log through the [log] table, which must map every state and input."""
     model, config, files = workspace.base_model, workspace.config, log_files(path)
     estimate = read_estimate(config.estimate, model) if config.estimate.values else None
     states = tuple(estimate.measured) if estimate else model.state_names

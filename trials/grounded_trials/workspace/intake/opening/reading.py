@@ -16,7 +16,6 @@ from grounded.checks import refused, same_dt, same_names
 from grounded.errors import GroundedError
 from grounded.findings import Finding
 from grounded.trial import Trial
-from grounded.units import same_unit
 from grounded_trials.plain_file import read_file
 from grounded_trials.store.own_files import FILE_LIMIT
 from grounded_trials.store.trial_file import read_trial, trial_bytes
@@ -100,18 +99,18 @@ def _other_units(workspace: Folder, meta: dict[str, str]) -> Iterator[str]:
     model = workspace.base_model
     for kind, own in (("states", model.states), ("inputs", model.inputs)):
         for name, unit in json.loads(meta[kind]).items():
-            if unit and "1" not in (unit.strip(), own[name]) and not same_unit(unit, own[name]):
+            if unit in ("", own[name]) or "1" in (unit.strip(), own[name]):
+                continue
+            from grounded.units import same_unit  # of a program of its own
+
+            if not same_unit(unit, own[name]):
                 yield f"{name} [{unit}, not {own[name]}]"
 
 
 def check_candidate(
     workspace: Folder, path: Path, candidate: str, task: str = "", policy: bytes | None = None
 ) -> None:
-    """Check that a candidate is of this workspace and task, and the policy equals its file.
-
-    Raises:
-        GroundedError: if not.
-    """
+    """Check that a candidate is of this workspace and task, and the policy equals its file."""
     if candidate not in workspace.candidate_ids():
         raise refused("log.earlier", path, ran=candidate, what="unknown")
     own = workspace.task.hash

@@ -1,4 +1,4 @@
-"""Detect recordings that are stored already: the same trial, a repeat, or another reading of it.
+"""Detect recordings that are stored already: the same trial, or another reading of it.
 
 One log, or one part of it, is one trial. Read through another [log] it would become a second trial
 that repeats the first with other numbers, which would invalidate any diagnosis.
@@ -15,7 +15,6 @@ import numpy as np
 from grounded.checks import refused
 from grounded.errors import NextCommand
 from grounded.trial import Trial
-from grounded_trials.logs.log_paths import log_files, on_disk
 from grounded_trials.store.trial_file import read_trial
 from grounded_trials.workspace.candidates.search_state import standing_in
 from grounded_trials.workspace.folder import Folder
@@ -29,11 +28,7 @@ if TYPE_CHECKING:
 def refuse_as_another(
     workspace: Folder, path: Path, stored: Sequence[StoredTrial], wanted: str | None
 ) -> None:
-    """Refuse a log that is stored as a run of another candidate, or as data.
-
-    Raises:
-        GroundedError: if it is stored as something else.
-    """
+    """Refuse a log that is stored as a run of another candidate, or as data."""
     ran = [one.trial.candidate for one in stored]
     if not ran or wanted in ran or (wanted is None and ran[-1]):
         return
@@ -47,11 +42,7 @@ def refuse_as_another(
 
 
 def as_stored(workspace: Folder, log: ForeignLog, trial: Trial, data: bytes) -> bytes:
-    """Return the stored file of a log's trial if it is stored, else the new one.
-
-    Raises:
-        GroundedError: if the same part of the log is stored with other numbers.
-    """
+    """Return the stored file of a log's trial, else the new one; refuse it with other numbers."""
     digest, now = sha256(data), log.source.get(ESTIMATED_WITH, "")
     for one in log.stored:
         same = one.trial.candidate == trial.candidate
@@ -77,20 +68,3 @@ def _span(meta: Mapping[str, str], trial: Trial) -> tuple[float, float]:
     """Return the start and the end of a trial on its log's clock [s]."""
     start = int(meta["start_ns"]) * 1e-9
     return start, start + trial.steps * trial.dt
-
-
-def repeated(workspace: Folder, path: Path, trial: Trial, data: bytes) -> str:
-    """Return the stored trial that a new run repeats to the last bit, or "".
-
-    The same bytes count as a new run, not as the old one ingested twice, if that candidate is
-    outstanding and the file was written after the stored one.
-    """
-    digest = sha256(data)
-    known = [one for one in workspace.store.list() if digest.startswith(one.digest)]
-    if not known or not trial.candidate:
-        return ""
-    waiting = standing_in(workspace).outstanding
-    files = [one for file in log_files(path) for one in on_disk(file)]
-    written = max(file.stat().st_mtime_ns for file in files)
-    fresh = written > known[-1].path.stat().st_mtime_ns
-    return known[-1].id if fresh and waiting and waiting.id == trial.candidate else ""
