@@ -107,28 +107,18 @@ class System(ABC):
         return np.asarray(np.abs(np.concatenate(slopes, axis=2)).max(axis=0) > FLAT)
 
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
-        """Where the user's function makes a number that is not finite, x (n,), u (m,); or "".
-
-        At the state itself, and where a first stage of the step goes.
-        """
-        signature = self.signature
-        sent, known = ([np.float64(v) for v in values] for values in (u, p))
-        for _ in range(2):
-            try:
-                with np.errstate(all="raise", under="ignore"):
-                    at = [np.float64(v) for v in x]
-                    values = signature.call(at, sent, known, np.float64(dt))
-            except (ArithmeticError, ValueError) as error:
-                kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
-                return f"{raised_at(error, signature.function)}: {kind}{error}"
-            found = np.array([float(values[name]) for name in signature.states])
-            if not np.isfinite(found).all():
-                name = signature.states[int(np.argmin(np.isfinite(found)))]
-                return f"{self.source}: {values[name]:g} for '{name}'"
-            if self.kind == "step":
-                break
-            x = x + 0.5 * dt * found
-        return ""
+        """Where a step from x (n,), u (m,) makes a number that is not finite; or ""."""
+        at, sent, known = ([np.float64(value) for value in some] for some in (x, u, p))
+        try:
+            with np.errstate(all="raise", under="ignore"):
+                whole = self.signature.whole(self.integrator)
+                after = whole.call(at, sent, known, np.float64(dt))
+        except (ArithmeticError, ValueError) as error:
+            kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
+            return f"{raised_at(error, self.signature.function)}: {kind}{error}"
+        found = {name: float(after[name]) for name in self.states}
+        bad = (f"{found[name]:g} for '{name}'" for name in found if not np.isfinite(found[name]))
+        return f"{self.source}: {said}" if (said := next(bad, "")) else ""
 
     def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
         """Inputs (N, m) that lead from x (N, n) to about `after` (N, n); None where unknown."""
