@@ -63,11 +63,6 @@ def _copied(kind: type[GroundedError], args: tuple[Any, ...], fields: dict[str, 
     return error
 
 
-def type_of(value: object) -> str:
-    """Return the name of a value's type, for a message: "str", "Candidate"."""
-    return type(value).__name__
-
-
 def alike(name: str, valid: Iterable[str]) -> str:
     """Return the valid name closest to `name`, or the only one that ends so; "" if none is."""
     from difflib import get_close_matches

@@ -85,16 +85,15 @@ class Record:
 
     def received(self, latency: Array) -> Array:
         """Return the inputs received over each step, (T, m), with the latency [s] of each (m,)."""
-        total = [self._integral(self.times - late, j) for j, late in enumerate(latency)]
-        return np.diff(np.stack(total, axis=1), axis=0) / np.diff(self.times)[:, None]
-
-    def _integral(self, t: Array, j: int) -> Array:
-        """Return the integral of command j from the first command to t."""
-        knots, values = self.command_times, np.append(self.past[j], self.commands[:, j])
-        total = np.append(0.0, np.cumsum(values[1:-1] * np.diff(knots)))
-        index = np.searchsorted(knots, t, side="right")
-        at = np.maximum(index - 1, 0)
-        return np.asarray(total[at] + values[index] * (t - knots[at]))
+        knots, found = self.command_times, list[Array]()
+        for j, late in enumerate(latency):
+            # the integral of the command from the first one on, at each instant
+            t, values = self.times - late, np.append(self.past[j], self.commands[:, j])
+            total = np.append(0.0, np.cumsum(values[1:-1] * np.diff(knots)))
+            index = np.searchsorted(knots, t, side="right")
+            at = np.maximum(index - 1, 0)
+            found.append(total[at] + values[index] * (t - knots[at]))
+        return np.diff(np.stack(found, axis=1), axis=0) / np.diff(self.times)[:, None]
 
 
 def cut(record: Record, seconds: float) -> list[Record]:
@@ -315,7 +314,8 @@ def filtered(model: Model, batch: RecordBatch, noise: NoiseStd) -> Filtered:
                 P[t + 1] = predicted(after, A[t + 1], system.Q[t + 1])
         except np.linalg.LinAlgError:
             status = f"the filter diverged to non-finite numbers at step {t + 1}"
-    loglik = _likelihood(g, eps, batch) if status == "filtered" else -np.inf
+        total = float(np.sum(eps**2) + g.logdet.sum()) + batch.count * np.log(2 * np.pi)
+    loglik = -0.5 * total if status == "filtered" and np.isfinite(total) else -np.inf
     return Filtered(x, x_prior, eps, g, loglik, status)
 
 
@@ -343,12 +343,6 @@ def _system(batch: RecordBatch, noise: NoiseStd, A: Array) -> LinearSystem:
     Q[1:] = np.where(batch.valid, batch.dt / noise.dt, 0.0)[..., None] * noise.process**2
     start = batch.start_var + np.where(batch.sampled, R, 0.0)
     return LinearSystem(A, Q, np.where(seen > 0, R, 1.0), seen, start)
-
-
-def _likelihood(g: Gains, eps: Array, batch: RecordBatch) -> float:
-    """Return the log-likelihood of whitened innovations; minus infinity if it is not finite."""
-    total = float(np.sum(eps**2) + g.logdet.sum()) + batch.count * np.log(2 * np.pi)
-    return -0.5 * total if np.isfinite(total) else -np.inf
 
 
 def first_process(batch: RecordBatch, sizes: Array | float = 1.0) -> Array:

@@ -307,16 +307,12 @@ class Integral:
     exact: bool = True
 
 
-def integrals(model: Model) -> list[Integral]:
+@lru_cache(maxsize=8)  # each log is read with the same model, which is asked twenty times
+def integrals(model: Model) -> tuple[Integral, ...]:
     """Return the pairs of position and velocity, and of angle and rate, of a model.
 
     A heading rate that the model only carries along is included, with `exact` false.
     """
-    return list(_integrals(model))
-
-
-@lru_cache(maxsize=8)  # each log is read with the same model, which is asked twenty times
-def _integrals(model: Model) -> tuple[Integral, ...]:
     names = model.state_names
     found = [
         Integral(names.index(name), names.index(other), c)

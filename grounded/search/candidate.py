@@ -55,7 +55,6 @@ class Candidate(Result):
     caution: float = 0  # how often the first policy, or its gains, were made gentler
     way: Way = ""  # how it was made
     slopes: Slopes = ""  # derivatives of the model that it was planned in
-    likely_off: float = 0.0  # likely error of predicted_gain, from held-out trials; 0: unknown
     sample_age: float = 0.0  # [s] of the samples that the robot acts on, allowed for in it
     seen: tuple[str, ...] = ()  # ids of the search's trials that were known when it was made
     units: Mapping[str, str] = field(default_factory=dict)  # of states and inputs, for figures
@@ -78,16 +77,6 @@ class Candidate(Result):
     def of_model_alone(self) -> bool:
         """Whether it is an optimal policy of a model that replays no trial."""
         return not self.base or self.way == "own plan"
-
-    @property
-    def expected_gain(self) -> float:
-        """The predicted gain less its likely error."""
-        return self.predicted_gain - self.likely_off
-
-    @property
-    def doubtful(self) -> bool:
-        """Whether the likely error is at least the predicted gain."""
-        return 0 < self.likely_off >= self.predicted_gain
 
     def promised_over(self, best: Tried) -> float:
         """Return the predicted gain over the best so far; every report uses this number.

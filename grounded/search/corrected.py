@@ -26,7 +26,6 @@ from grounded.policy import Policy
 from grounded.rollout import SETTLED, Rollout, seen_late
 from grounded.search.planner import predicted
 
-MOST_GAINS = 2**22  # gains held at once
 Flags = NDArray[np.bool_]
 
 
@@ -134,10 +133,6 @@ def runs(problems: Sequence[Problem], policies: Sequence[Policy]) -> list[Rollou
     if len(systems) < len(problems) or open_loop or not systems:
         return [predicted(*each) for each in zip(problems, policies, strict=True)]
     problem, system = problems[0], _with_each_law(systems)
-    room = max(1, MOST_GAINS // (problem.horizon * problem.nz * system.m))
-    if len(policies) > room:  # long horizons
-        parts = [slice(i, i + room) for i in range(0, len(policies), room)]
-        return [run for part in parts for run in runs(problems[part], policies[part])]
     for policy in policies:  # z holds all past inputs that any of them feeds back
         problem = replace(problem, fed_back=deepest(problem.depths, policy.depths))
     angles, n = tuple(map(bool, problem.angles)), system.n

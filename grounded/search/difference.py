@@ -17,7 +17,7 @@ from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain, pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -217,28 +217,14 @@ def one_trial_error(best: Tried, repeats: int = 1) -> float:
 
 
 def in_question(made: Candidate, best: Tried, repeats: int = 1) -> Finding | None:
-    """Return that a candidate promises less than its trial, or its model, can tell; None if not.
-
-    A gain below `SHOWN` standard errors may be luck, and one below the model's likely error may be
-    none.
-    """
-    own = best.candidate.id
+    """Return that a candidate promises less than `SHOWN` errors of its trial's gain; else None."""
+    own, gain, cost = best.candidate.id, made.promised_over(best), abs(best.utility)
     luck = SHOWN * one_trial_error(best, repeats) if made.base == own else 0.0
-    error = made.likely_off if made.doubtful else 0.0
-    gain, cost = made.promised_over(best), abs(best.utility)
-    if not (made.doubtful or 0 < gain < luck):
+    if not 0 < gain < luck:
         return None
-    little = 0 < gain < DOUBTFUL_GAIN * cost and not best.is_unsteady
-    return found(
-        "plan.small",
-        made.id,
-        candidate=made.id,
-        best=own,
-        gain=gain,
-        luck=luck if luck >= error else None,
-        error=error if error > luck else None,
-        share=gain / cost if little else None,
-    )
+    share = gain / cost if gain < DOUBTFUL_GAIN * cost and not best.is_unsteady else None
+    about: dict[str, Any] = {"candidate": made.id, "best": own}
+    return found("plan.small", made.id, gain=gain, luck=luck, share=share, **about)
 
 
 def student(x: float, freedom: float) -> float:

@@ -172,29 +172,22 @@ def _improvement(make: Maker, incumbent: Tried, options: SearchOptions) -> Propo
 def _step(about: About) -> Proposal | None:
     """Return the due step, by the derivatives that promise most.
 
-    Steps of derivatives that hold for each step of the run by itself go on.
+    Steps by derivatives corrected step by step go on with these.
     """
-    base, due, by_step = about.incumbent.candidate, about.make.now.step, _by_step(about)
+    make, incumbent, options = about.make, about.incumbent, about.options
+    base, due, by_step = incumbent.candidate, make.now.step, None
     assert due is not None
-    if by_step is not None and base.way == BY_STEP and base.model == about.make.fingerprint:
+    again = options.due(make.now.history, incumbent, make.fingerprint, BY_STEP)
+    if again is not None:
+        stepping = About(make, incumbent, options, BY_STEP)
+        by_step = stepping.step_from(again) if stepping.corrected else None
+    if by_step is None or by_step.candidate is None:
+        return about.step_from(due)
+    if base.way == BY_STEP and base.model == make.fingerprint:
         return by_step
-    return max((about.step_from(due), by_step), key=_promise)  # the first of equal ones
-
-
-def _promise(made: Proposal | None) -> float:
-    """Return the predicted gain of a step less its likely error; -inf for none."""
-    return made.candidate.expected_gain if made and made.candidate else -math.inf
-
-
-def _by_step(about: About) -> Proposal | None:
-    """Return a step by derivatives corrected step by step; None if none is due or worth a trial."""
-    make, options = about.make, about.options
-    step = options.due(make.now.history, about.incumbent, make.fingerprint, BY_STEP)
-    if step is None:
-        return None
-    stepping = About(make, about.incumbent, options, BY_STEP)
-    made = stepping.step_from(step) if stepping.corrected else None
-    return made if made and made.candidate else None
+    found = about.step_from(due)
+    gain = found.candidate.predicted_gain if found and found.candidate else -math.inf
+    return found if gain >= by_step.candidate.predicted_gain else by_step
 
 
 def _below_noise(
@@ -219,18 +212,15 @@ def _below_noise(
 
 def _ended(make: Maker, incumbent: Tried, rejected: About, options: SearchOptions) -> Standing:
     """Return the standing of a search in which no step is worth a trial, with the reason."""
-    own, doubted = incumbent.candidate.id, rejected.doubted
+    own = incumbent.candidate.id
     lost = losers_of(make.now.history, own, make.fingerprint)
     finite = [gain for gain in rejected.promised if np.isfinite(gain)]
     most, ask = max(finite, default=0.0), found("search.diagnose", then=DIAGNOSE)
-    if doubted is None and rejected.promised and not finite:
+    if rejected.promised and not finite:
         return ended(make.now, Ending.DIVERGES, found("search.diverges", own, best=own), ask)
-    if doubted is None and most < -rejected.least and not lost:
+    if most < -rejected.least and not lost:
         why = found("search.diverges", own, best=own, least=-most)
         return ended(make.now, Ending.EVERY_STEP_LOSES, why, ask)
-    if doubted is not None:
-        gain, error = doubted.predicted_gain, doubted.likely_off
-        return _no_step(make, incumbent, Ending.NO_STEP, gain=gain, error=error)
     ending = Ending.NO_STEP if lost else Ending.NOTHING_PROMISED
     return _no_step(make, incumbent, ending, least=options.tolerance)
 

@@ -11,11 +11,11 @@ import numpy as np
 from grounded.compile.problem import DescentOptions, Problem
 from grounded.frozen import Array
 from grounded.policy import Policy
-from grounded.rollout import Rollout, apart, for_late_samples
+from grounded.rollout import Rollout, for_late_samples
 from grounded.search.candidate import BY_STEP, Candidate, Slopes, Tried, Way
 from grounded.search.corrected import Corrected
 from grounded.search.feedback import between_limits, limit_cycle, planned_age
-from grounded.search.mispredictions import Believed, believed, believed_by_step
+from grounded.search.mispredictions import believed, believed_by_step
 from grounded.search.noise import beyond_noise
 from grounded.search.planner import Planner, predicted
 from grounded.search.safety import objections, spread
@@ -74,20 +74,16 @@ class About:
         exact = ground(plan, own, exact=True, shift=self.grounding.shift)
         real = exact.on(replace(plan.problem(exact=True), age=make.age))
         self.theta = planner.widened(incumbent.candidate.policy)
-        self.run = (own.states[:, : planner.task.model.n], own.inputs)
-        found: Believed | None = None
+        self.corrected: Corrected | None = None
         if way == BY_STEP:
-            found = believed_by_step(planner, incumbent, make.now.history, real)
+            self.corrected = believed_by_step(planner, incumbent, make.now.history, real)
         elif options.damps and len(make.now.history) > 1 and not self._kept():
-            found = believed(planner, incumbent, make.now.history, real)
-        found = found or Believed(real)
-        self.real, self.corrected = found.problem, found.corrected
-        self.missed = found.missed  # likely error of the model's movements, as a share of them
+            self.corrected = believed(planner, incumbent, make.now.history, real)
+        self.real = self.corrected.on(real) if self.corrected else real
         already = predicted(self.real, incumbent.candidate.policy).utility
         self.already = already if np.isfinite(already) else incumbent.utility
         self.least = options.tolerance * abs(self.already)
         self.promised: list[float] = []  # gains of steps that were too small
-        self.doubted: Candidate | None = None  # a step that is not made for its likely error
 
     @property
     def slopes(self) -> Slopes:
@@ -105,26 +101,19 @@ class About:
         return not lost and abs(off) <= (1 - KEPT_PROMISE) * made.predicted_gain
 
     def candidate(self, policy: Policy, step: Step, way: Way) -> Candidate:
-        """Return a candidate with this model's prediction and its likely error."""
+        """Return a candidate with this model's prediction."""
         made = self.make.candidate(policy, self.real, step, self.already, way)
-        moved = apart(self.real, (made.predicted_states, made.predicted_inputs), self.run)
-        off = self.missed * moved if self.missed else 0.0
-        return replace(made, slopes=self.slopes, likely_off=off)
+        return replace(made, slopes=self.slopes)
 
     def step_from(self, first: Step) -> Proposal | None:
         """Return the first step worth a trial, else one that is not allowed, else None.
 
-        A step whose likely error exceeds its gain is only used if there is no other, and none that
-        may lose more than the best one costs.
-
-        Args:
-            first: the due step, regardless of the derivatives of those that lost.
+        `first` is the due step, regardless of the derivatives of those that lost.
         """
         make, options = self.make, self.options
         known = (make.now.history, self.incumbent, make.fingerprint)
         first = options.due(*known, self.way, self.slopes) or first
         unsafe: Proposal | None = None
-        doubted: Proposal | None = None
         directions: dict[float, Policy] = {}
         for step in options.steps_from(first):
             if step.damping not in directions:
@@ -142,31 +131,22 @@ class About:
             made = self.candidate(policy, step, self.way)
             if made.predicted_gain > self.least:
                 proposal = make.checked(made)
-                if proposal.candidate is None:
-                    unsafe = proposal
-                    continue
-                if made.expected_gain < self.incumbent.utility:  # it may lose the best cost again
-                    self.doubted = self.doubted or made
-                elif made.expected_gain > self.least:
+                if proposal.candidate is not None:
                     return proposal
-                else:
-                    doubted = doubted or proposal
+                unsafe = proposal
                 continue
             self.promised.append(made.predicted_gain)
             if abs(made.predicted_gain) <= self.least:
                 break
-        return doubted or unsafe
+        return unsafe
 
     def own_plan(self, rival: Proposal | None) -> Proposal | None:
         """Return the changed model's own plan if its predicted gain exceeds the rival's.
 
         The plan of the crude model may lie near another local optimum than that of the better
-        model, where local steps from it can't go. Both are judged by the grounded prediction less
-        its likely error. No gain is required if the incumbent's trial failed badly or was a limit
-        cycle, since a bias measured there does not apply to other runs.
-
-        Args:
-            rival: the best step along a direction; None if there is none.
+        model, where local steps from it can't go. Both are judged by the grounded prediction. No
+        gain is required if the incumbent's trial failed badly or was a limit cycle, since a bias
+        measured there does not apply to other runs.
         """
         make, base = self.make, self.incumbent.candidate
         tried = losers_of(make.now.history, base.id, make.fingerprint, "own plan")
@@ -174,9 +154,9 @@ class About:
             return None
         policy, _ = make.planner.first_policy()
         made = self.candidate(for_late_samples(policy, self.real), Step(), "own plan")
-        promise = rival.candidate.expected_gain if rival and rival.candidate else self.least
+        promise = rival.candidate.predicted_gain if rival and rival.candidate else self.least
         swung = wild(self.incumbent) or limit_cycle(self.incumbent, make.planner.task)
-        if not (swung or made.expected_gain > max(promise, self.least)):
+        if not (swung or made.predicted_gain > max(promise, self.least)):
             return None
         proposal = make.checked(made)
         return proposal if proposal.candidate is not None else None

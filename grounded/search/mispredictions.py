@@ -19,14 +19,12 @@ distance from the incumbent, are chosen by cross-validation over parts of the ru
 "Cross-validatory choice and assessment of statistical predictions", J. R. Stat. Soc. B 36, 1974).
 
 The choice between the crude and the corrected derivatives is made by leaving out the nearest trials
-in turn. Each model, fitted to the others, runs the policy of the trial left out. `Believed.missed`
-is the share of that trial's difference from the incumbent's (`apart`, in units of the cost) that
-the model does not predict. The model with the lower value is used. The same share of a new step is
-likely to be mispredicted, so a step that might lose because of it is put last (`making.About`).
-Steps that were made with corrected derivatives and lost are also left out in turn, at any distance:
-laws that such a trial refutes still predict trials nearby.
-With a single other trial nothing can be left out: the value is then at least the share of the
-mispredictions that law 1 leaves in the held-out parts of the run.
+in turn. Each model, fitted to the others, runs the policy of the trial left out. What counts is the
+share of that trial's difference from the incumbent's (`apart`, in units of the cost) that the model
+does not predict; the model with the lower value is used. Steps that were made with corrected
+derivatives and lost are also left out in turn, at any distance: laws that such a trial refutes
+still predict trials nearby. With a single other trial nothing can be left out: the value is then at
+least the share of the mispredictions that law 1 leaves in the held-out parts of the run.
 
 The laws hold at all times of a run. Two trials determine them, but no such law describes tyres that
 lose grip, a filter on top of a wrong inertia, or a pusher that sticks and slides. So once two steps
@@ -39,14 +37,13 @@ A dozen trials determine E_t in a dozen directions at most. Ridge regression lea
 others, as a secant method leaves the derivatives across its steps (Broyden, "A class of methods for
 solving nonlinear simultaneous equations", Math. Comp. 19, 1965), with the nearest trials weighted
 most. Lost trials count as much as others: nothing else shows what a step does that lost. These
-derivatives make a step if it promises more than any other, each promise less its likely error
-(`improve`), and the steps after that.
+derivatives make a step if it promises more than any other (`improve`), and the steps after that.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -82,25 +79,16 @@ class Seen:
     policy: Policy
 
 
-@dataclass(frozen=True, eq=False)
-class Believed:
-    """A model that replays the incumbent's trial, and the share of movements it mispredicts."""
-
-    problem: Problem
-    corrected: Corrected | None = None
-    missed: float = 0.0
-
-
 def believed(
     planner: Planner,
     incumbent: Tried,
     history: Sequence[Tried],
     grounded: Problem,
-) -> Believed:
-    """Return the exact grounded model, with derivatives corrected if those predict better."""
+) -> Corrected | None:
+    """Return the exact grounded model with corrected derivatives, if those predict better."""
     known = neighbours(planner, incumbent, history, grounded)
     if known is None:
-        return Believed(grounded)
+        return None
     own, nearest = known
     others = [o for o, _ in nearest]
     refuting = [o for o, t in nearest[ASKED:] if t.candidate.of_corrected and t.lost]
@@ -109,18 +97,20 @@ def believed(
     rests = [[o for o in others if o is not other] for other in asked]
     fits = [laws(own, rest or others, grounded) for rest in rests]
     crude = unforetold([grounded] * len(asked), own, asked)
-    fitted = [k for k, (law, _) in enumerate(fits) if law is not None]
-    models = [with_law(fits[k][0], own, grounded).problem for k in fitted]
-    shares = dict(zip(fitted, unforetold(models, own, [asked[k] for k in fitted]), strict=True))
+    fitted = [
+        (k, with_law(law, own, grounded)) for k, (law, _) in enumerate(fits) if law is not None
+    ]
+    models = [made.on(grounded) for _, made in fitted]
+    missed = unforetold(models, own, [asked[k] for k, _ in fitted])
+    shares = dict(zip([k for k, _ in fitted], missed, strict=True))
     corrected = [
         shares.get(k, 1.0) if rests[k] else max(shares.get(k, 1.0), left)
         for k, (_, left) in enumerate(fits)
     ]
     law, _ = laws(own, others, grounded)
-    misses = float(np.mean(crude)), float(np.mean(corrected))
-    plain = misses[0] <= misses[1]
-    model = Believed(grounded) if plain else with_law(law, own, grounded)
-    return replace(model, missed=min(misses))
+    if law is None or float(np.mean(crude)) <= float(np.mean(corrected)):
+        return None
+    return with_law(law, own, grounded)
 
 
 def neighbours(
@@ -137,12 +127,9 @@ def neighbours(
     return (own, nearest) if nearest else None
 
 
-def with_law(law: Array | None, own: Seen, grounded: Problem) -> Believed:
-    """Return the grounded model with a law (H, n, 2 n + 2 m) added; None for no law."""
-    if law is None:
-        return Believed(grounded)
-    made = Corrected(grounded.system, law, own.x, own.u, own.before)
-    return Believed(made.on(grounded), made)
+def with_law(law: Array, own: Seen, grounded: Problem) -> Corrected:
+    """Return the model with a law (H, n, 2 n + 2 m) added."""
+    return Corrected(grounded.system, law, own.x, own.u, own.before)
 
 
 def unforetold(models: Sequence[Problem], own: Seen, others: Sequence[Seen]) -> list[float]:
@@ -280,7 +267,7 @@ def shared(d: Array, y: Array, far: Array) -> tuple[Array, float]:
 
 def believed_by_step(
     planner: Planner, incumbent: Tried, history: Sequence[Tried], grounded: Problem
-) -> Believed | None:
+) -> Corrected | None:
     """Return the exact grounded model with derivatives corrected step by step.
 
     None if fewer than two other trials are known, or if it does not predict those that are left
@@ -292,11 +279,11 @@ def believed_by_step(
     own, others = known[0], [other for other, _ in known[1]]
     asked = others[:ASKED]
     rests = [laws_by_step([o for o in others if o is not one], own, grounded) for one in asked]
-    missed = unforetold([with_law(law, own, grounded).problem for law in rests], own, asked)
+    missed = unforetold([with_law(law, own, grounded).on(grounded) for law in rests], own, asked)
     if not np.mean(missed) < 1.0:
         return None
     law = laws_by_step(others, own, grounded)
-    return replace(with_law(law, own, grounded), missed=float(np.mean(missed)))
+    return with_law(law, own, grounded)
 
 
 def laws_by_step(others: Sequence[Seen], own: Seen, grounded: Problem) -> Array:

@@ -23,7 +23,6 @@ from grounded.model import Model
 from grounded.policy import Policy
 from grounded.task import Task
 from grounded.trial import Trial
-from grounded.utility import Reward
 
 if TYPE_CHECKING:
     from grounded.compile.problem import Problem
@@ -219,7 +218,7 @@ def planner_with(
     Raises:
         GroundedError: for an unknown effect, or a quantity that is missing or unknown.
     """
-    from grounded.effects import Library, param_name, wrap, wrapping_order
+    from grounded.effects import Library, memory_start, param_name, wrap, wrapping_order
     from grounded.effects.family import Effect, InputFamily, MemoryFamily, Scales, Site
     from grounded.effects.wrap import late_by
 
@@ -254,8 +253,27 @@ def planner_with(
         for (name, _), family in zip(effects, families, strict=True)
         if family.name == "backlash"
     )
-    made = planner_for(task, model, latency)
-    return dataclasses.replace(made, widths=widths, plays=plays)
+    # The states that effects added begin as they are while the held input is sent, and are free.
+    names, extra = (task.model.state_names, task.model.input_names), model.n - task.model.n
+    held = Trial(task.start[None], task.past[None][:0], task.dt, *names, start_inputs=task.past)
+    memory = memory_start(model, task.model, held) if extra else np.zeros(0)
+    free, weights = np.full(extra, np.inf), task.reward
+    assert task.safety_low is not None and task.safety_high is not None
+    plan = dataclasses.replace(
+        task,
+        model=model,
+        latency=latency,
+        target=np.hstack([task.target, np.full((task.horizon + 1, extra), np.nan)]),
+        reward=dataclasses.replace(
+            weights,
+            state=np.append(weights.state, 0 * memory),
+            terminal=np.append(weights.terminal, 0 * memory),
+        ),
+        start=np.append(task.start, memory),
+        safety_low=np.append(task.safety_low, -free),
+        safety_high=np.append(task.safety_high, free),
+    )
+    return Planner(task, plan, widths, plays)
 
 
 WHOLE = 1e-6  # tolerance, as a fraction of a step, for whole numbers of steps
@@ -264,39 +282,3 @@ WHOLE = 1e-6  # tolerance, as a fraction of a step, for whole numbers of steps
 def _input(task: Task, name: str, target: str) -> int:
     known("input", [target], task.model.input_names, f"effect '{name}'")
     return task.model.input_names.index(target)
-
-
-def planner_for(task: Task, model: Model, latency: np.ndarray) -> Planner:
-    """Return a planner with a model whose first states are the task's, and a latency [s] (m,)."""
-    extra = model.n - task.model.n
-    held = Trial(
-        states=task.start[None],
-        inputs=np.zeros((0, task.model.m)),
-        dt=task.dt,
-        state_names=task.model.state_names,
-        input_names=task.model.input_names,
-        start_inputs=task.past,
-    )
-    memory = np.zeros(0)
-    if extra:  # importing effects is slow, and most models have none
-        from grounded.effects import memory_start
-
-        memory = memory_start(model, task.model, held)
-    nothing, reward = np.zeros(extra), task.reward
-    assert task.safety_low is not None and task.safety_high is not None
-    plan = dataclasses.replace(
-        task,
-        model=model,
-        latency=latency,
-        target=np.hstack([task.target, np.full((task.horizon + 1, extra), np.nan)]),
-        reward=Reward(
-            np.append(reward.state, nothing),
-            np.append(reward.terminal, nothing),
-            reward.input,
-            reward.input_change,
-        ),
-        start=np.append(task.start, memory),
-        safety_low=np.append(task.safety_low, np.full(extra, -np.inf)),
-        safety_high=np.append(task.safety_high, np.full(extra, np.inf)),
-    )
-    return Planner(task, plan)

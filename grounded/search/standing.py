@@ -144,12 +144,6 @@ class Standing(Result):
             return None
         return Difference(own, best, self.history) if best.candidate is not own.candidate else None
 
-    @property
-    def lead_doubt(self) -> Finding | None:
-        """What may explain the best one's lead on the model's own policy."""
-        lead = self.lead
-        return lead.lead if lead is not None and not lead.sure else None
-
     def verdict(self, tried: Tried) -> str:
         """Return the verdict on a candidate, see `Tried.verdict`."""
         return tried.verdict(tried.candidate is (self.outstanding or self.history[-1].candidate))
@@ -162,7 +156,7 @@ class Standing(Result):
 
     def to_json(self) -> dict[str, Any]:
         """Return the document of `grounded status --json`, with the whole history."""
-        best, gain = self.incumbent, last_gain(self.history)
+        best, gain, lead = self.incumbent, last_gain(self.history), self.lead
         return document(
             phase=self.phase,
             iteration=self.iteration,
@@ -170,7 +164,7 @@ class Standing(Result):
             and {
                 "candidate": best.candidate.id,
                 "utility": best.utility,
-                "lead_doubt": doubt.sentence if (doubt := self.lead_doubt) else None,
+                "lead_doubt": lead.lead.sentence if lead and not lead.sure else None,
             },
             utilities=self.utilities,
             trials=self.trials,
@@ -367,8 +361,8 @@ def let_down(now: Standing, model: str) -> Standing:
     """Return an ended search; it asks for a diagnosis if the model promises much that it lacks.
 
     A plan of the model alone promises what that reaches beyond the best run, a step that has lost
-    what it was to gain. Much is more than DOUBTFUL_GAIN of the best cost, more than a step's own
-    likely error, and not to be explained by noise.
+    what it was to gain. Much is more than DOUBTFUL_GAIN of the best cost, and not to be explained
+    by noise.
     """
     best = now.incumbent
     if best is None:
@@ -378,7 +372,7 @@ def let_down(now: Standing, model: str) -> Standing:
         made, between = tried.candidate, Difference(best, tried, now.history)
         if made.of_model_alone and made.model == model:
             short = promised = tried.promised - best.utility
-        elif made in lost and not made.doubtful:
+        elif made in lost:
             loss, promised = -tried.gain_over(best), made.predicted_gain
             short = min(loss + promised, max(loss, promised))
         else:

@@ -188,7 +188,7 @@ def test_the_probability_is_the_t_tests():
 
 def test_more_repeats_of_each_candidate_show_smaller_gains():
     best = replace(tried(*(-1.0,) * 9), deviation=0.1)
-    made = SimpleNamespace(id="c2", base="c", promised_over=lambda _: 0.1, doubtful=False)
+    made = SimpleNamespace(id="c2", base="c", promised_over=lambda _: 0.1)
     assert in_question(made, best) and not in_question(made, best, repeats=9)
 
 

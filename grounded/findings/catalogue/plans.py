@@ -61,9 +61,8 @@ PLAN: dict[str, Entry] = {
         "its run go on improving it",
     ),
     "small": note(
-        "{candidate} promises {gain:.2g} over {best}, less than [[its trial can show: a gain "
-        "below {luck:.2g} may be luck]][[the model's likely error there, judging by earlier "
-        "trials: {error:.3g}]]",
+        "{candidate} promises {gain:.2g} over {best}, less than its trial can show: a gain below "
+        "{luck:.2g} may be luck",
         "[[it gains at most {share:%} of what {best} costs: run it if that is worth a run, else "
         "stop with {best} (`export best`)]]",
     ),

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from grounded.checks import near
-from grounded.errors import type_of
 from grounded.units import in_another_unit
 from grounded_trials.formats.bad import BadMessage, BadPath
 from grounded_trials.formats.message_path import (
@@ -147,7 +146,7 @@ def _kind(value: Any) -> str:
     """Return what to call a value's type in a message."""
     described = getattr(value, "DESCRIPTOR", None)
     named = getattr(value, "__msgtype__", "") or (described.full_name if described else "")
-    return str(named) or ("list" if is_list(value) else type_of(value))
+    return str(named) or ("list" if is_list(value) else type(value).__name__)
 
 
 def _items(value: Any, step: Slice) -> Values:
@@ -180,7 +179,7 @@ def _passes(values: Values, step: Filter) -> list[bool]:
         value = value.decode("utf-8", "replace") if isinstance(value, bytes) else value
         known = value is None or isinstance(value, str) or _is_number(value)
         if not known or isinstance(value, str) != isinstance(step.value, str):
-            expected, at = type_of(step.value), ".".join(step.path)
+            expected, at = type(step.value).__name__, ".".join(step.path)
             raise BadPath("path", at=at, expected=expected, found=_kind(value))
         passes[row] = value is not None and bool(_COMPARE[step.operator](value, step.value))
     return passes

@@ -50,13 +50,12 @@ _FIELDS: Mapping[str, Callable[[str], Any]] = {
     "caution": float,
     "way": str,
     "slopes": str,
-    "likely_off": float,
     "sample_age": float,
     "seen": lambda text: tuple(filter(None, text.split(","))),
 }
 # of files of earlier versions
 _ABSENT = dict.fromkeys(("way", "slopes", "seen"), "") | {"predicted_gain": "nan", "damping": "1.0"}
-_ABSENT |= dict.fromkeys(("caution", "likely_off", "sample_age"), "0.0")
+_ABSENT |= dict.fromkeys(("caution", "sample_age"), "0.0")
 
 
 @dataclass(frozen=True, eq=False)
