@@ -18,7 +18,7 @@ from grounded.errors import GroundedError, NextCommand
 from grounded.policy import load
 from grounded_trials import Workspace
 from grounded_trials.store.candidate_file import encoded_candidate, read_candidate
-from grounded_trials.workspace.candidates.exporting import RUNNER, export_candidate
+from grounded_trials.workspace.candidates.exporting import RUNNER, export_in
 from grounded_trials.workspace.candidates.handover import checked_candidate, outside_limits
 from grounded_trials.workspace.candidates.proposing import propose_in
 from grounded_trials.workspace.candidates.running import run_candidate
@@ -252,7 +252,7 @@ def test_an_open_loop_policy_must_send_and_hold_what_is_allowed(w):
 def exported(w, folder, form):
     propose_in(w)
     path = folder / f"c.{form}"
-    assert export_candidate(w, "c0001", form, path).candidate == "c0001"
+    assert export_in(w, "c0001", path, form=form).candidate == "c0001"
     return path
 
 
@@ -325,7 +325,7 @@ def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
     w = make(tmp_path / "w")
     (tmp_path / "robot").mkdir()
     propose_in(w)
-    done = export_candidate(w, "c0001", path=tmp_path / "robot" / "c.npz", runner=True)
+    done = export_in(w, "c0001", tmp_path / "robot" / "c.npz", runner=True)
     assert done.format == "npz" and done.runner == tmp_path / "robot" / RUNNER
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); import grounded_runner as g\n"
@@ -339,7 +339,7 @@ def test_the_runner_beside_an_export_drives_without_grounded(tmp_path):
     expected = [float(here.action(0.05 * k, [0.01 * k, 0.0])[0]) for k in range(40)]
     assert [float(u) for u in found.split()] == expected
     with pytest.raises(GroundedError, match=holding("npz", "json")):
-        export_candidate(w, "c0001", "json", tmp_path / "c.json", runner=True)
+        export_in(w, "c0001", tmp_path / "c.json", form="json", runner=True)
 
 
 def test_after_the_search_an_export_asks_for_no_further_run(tmp_path):
@@ -360,10 +360,10 @@ def test_a_candidate_is_exported_beside_a_damaged_file_of_another(tmp_path):
     damaged = w.store.list()[-1].path
     damaged.chmod(0o644)
     damaged.write_bytes(damaged.read_bytes()[:-100])
-    done = export_candidate(Folder(w.folder), "c0001", "json", tmp_path / "c.json")
+    done = export_in(Folder(w.folder), "c0001", tmp_path / "c.json", form="json")
     assert done.file.is_file() and done.named == ("--candidate", "c0001")
     with pytest.raises(GroundedError, match="damaged"):  # which one is best, nobody knows
-        export_candidate(Folder(w.folder), "best", "json", tmp_path / "b.json")
+        export_in(Folder(w.folder), "best", tmp_path / "b.json", form="json")
 
 
 def test_a_candidate_that_was_exported_is_to_be_run_and_its_log_taken_in(tmp_path, monkeypatch):
@@ -373,7 +373,7 @@ def test_a_candidate_that_was_exported_is_to_be_run_and_its_log_taken_in(tmp_pat
     for form in ("npz", "json", "csv"):
         assert to_run(w, "c0001").verb == "export"
         path = tmp_path / f"c0001.{form}"
-        export_candidate(w, "c0001", form, path)
+        export_in(w, "c0001", path, form=form)
         assert to_run(w, "c0001").verb == "next" and exported_as(w, "c0001") == form
         path.unlink()
 

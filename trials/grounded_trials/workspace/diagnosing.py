@@ -13,7 +13,7 @@ import numpy as np
 from grounded.accounts.finding import in_the_log
 from grounded.accounts.sound_trials import sound_trials
 from grounded.diagnosis.diagnose import DiagnosisOptions, diagnose
-from grounded.diagnosis.parts import Estimate, Made, Ranked
+from grounded.diagnosis.parts import Made, Ranked
 from grounded.diagnosis.telling import NEXT
 from grounded.errors import GroundedError, NextCommand
 from grounded.findings import Finding
@@ -153,18 +153,15 @@ def _with_next(
 def _as_known(ranking: Sequence[Ranked], row: float) -> tuple[Ranked, ...]:
     """Widen delays in the ranking by the interval of table rows [s], see `Gridded`."""
 
-    def wider(name: str, one: Estimate) -> Estimate:
-        if name != "d" or one.interval is None:
+    def wider(one: Ranked) -> Ranked:
+        late = one.params.get("d")
+        if late is None or late.interval is None or not one.effect.startswith("delay:"):
             return one
-        low, high = one.interval
-        return replace(one, std=math.hypot(one.std, row / 2), interval=(low - row, high + row))
+        low, high = late.interval
+        std, interval = math.hypot(late.std, row / 2), (low - row, high + row)
+        return replace(one, params={**one.params, "d": replace(late, std=std, interval=interval)})
 
-    return tuple(
-        replace(one, params={name: wider(name, e) for name, e in one.params.items()})
-        if row and one.effect.startswith("delay:")
-        else one
-        for one in ranking
-    )
+    return tuple(wider(one) if row else one for one in ranking)
 
 
 def instruments_in(workspace: Folder, trials: Sequence[str] = ()) -> tuple[Fault, ...]:

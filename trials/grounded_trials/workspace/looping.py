@@ -14,7 +14,7 @@ from grounded.result import UNSAID, Document
 from grounded.search.candidate import Candidate
 from grounded.search.standing import Phase
 from grounded_trials.plain_file import path_of
-from grounded_trials.workspace.candidates.exporting import Exported, export_candidate
+from grounded_trials.workspace.candidates.exporting import Exported, export_in
 from grounded_trials.workspace.candidates.proposing import Proposed, Status, propose_in, status_of
 from grounded_trials.workspace.candidates.running import run_candidate
 from grounded_trials.workspace.candidates.search_state import standing_in
@@ -132,5 +132,5 @@ def next_in(
         name, form = proposed.candidate.id, exported_as(workspace, taken.candidate or "")
         runner = runner and form in ("", "npz")
         file = workspace.folder / f"{name}.{form or ('npz' if runner else 'json')}"
-        exported = export_candidate(workspace, name, form, file, runner=runner)
+        exported = export_in(workspace, name, file, form=form, runner=runner)
     return NextRun(taken, proposed, exported)

@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -132,55 +132,23 @@ def export_in(
         workspace: the workspace.
         candidate: c0003, `best`, or a trial, t0007.
         path: the file; None: named after the candidate, in the current folder.
-        form: csv, json or npz; of a trial csv or npz; None: by the file's suffix.
+        form: csv, json or npz; of a trial csv or npz; None: by the file's suffix, else json, npz
+            with `runner`, csv of a trial.
         runner: write npz, and beside it the program that runs it on a robot with only numpy.
         anyway: write it although it is void.
     """
-    identity, file = candidate.lower(), Path(path) if path else None
-    if not identity.startswith("t"):
-        return export_candidate(workspace, identity, form, file, runner=runner, anyway=anyway)
-    if runner:
+    identity = candidate.lower()
+    if (trial := identity.startswith("t")) and runner:
         raise unknown_candidate(workspace, identity)
-    return _export_trial(workspace, identity, form, file)
-
-
-def _export_trial(
-    workspace: Folder, identity: str, form: str | None, path: Path | None
-) -> Exported:
-    """Write a trial as a table with a row for each state."""
-    form = form_of(form, path, RUNS, "csv")
-    path = path or Path(f"{identity}.{form}")
-    trial = next((one.trial for one in workspace.trials() if one.trial.id == identity), None)
-    if trial is None:
-        raise unknown_trial(workspace, identity)
-    last = np.full((1, trial.inputs.shape[1]), np.nan)  # the last state has no input
-    times = trial.dt * np.arange(len(trial.states))[:, None]
-    rows = np.hstack([times, trial.states, np.vstack([trial.inputs, last])])
-    names, stream = ("t", *trial.state_names, *trial.input_names), io.BytesIO()
-    if form == "npz":
-        np.savez(stream, **dict(zip(names, rows.T, strict=True)))
-    else:
-        np.savetxt(stream, rows, fmt="%.10g", delimiter=",", header=",".join(names), comments="")
-    write_atomically(path, stream.getvalue())
-    return Exported(identity, path, form)
-
-
-def export_candidate(
-    workspace: Folder,
-    identity: str,
-    form: str | None = None,
-    path: Path | None = None,
-    *,
-    runner: bool = False,
-    anyway: bool = False,
-) -> Exported:
-    """Write a candidate to a file, see `export_in`.
-
-    Without `form` the ending of `path` decides the format; without one it is npz with `runner`,
-    else json.
-    """
-    form = form_of(form, path, FORMS, "npz" if runner else "json")
-    path = path or Path(f"{identity}.{form}")
+    formats, usual = (RUNS, "csv") if trial else (FORMS, "npz" if runner else "json")
+    ending = Path(path).suffix.lstrip(".").lower() if path else ""
+    if form or ending:
+        one_of("the format" if form else f"the ending of {path}", form or ending, formats)
+    form = form or ending or usual
+    path = Path(path or f"{identity}.{form}")
+    if trial:
+        write_atomically(path, _run(workspace, identity, form))
+        return Exported(identity, path, form)
     if runner:
         one_of("format of the runner", form, ["npz"])
     now = standing_in(workspace) if identity == "best" else None
@@ -207,9 +175,17 @@ def export_candidate(
     return Exported(identity, path, form, program, told, ended, named)
 
 
-def form_of(form: str | None, path: Path | None, formats: Sequence[str], default: str) -> str:
-    """Return the format that was asked for, or that a file's ending names; else the default."""
-    ending = path.suffix.lstrip(".").lower() if path else ""
-    if form or ending:
-        one_of("the format" if form else f"the ending of {path}", form or ending, formats)
-    return form or ending or default
+def _run(workspace: Folder, identity: str, form: str) -> bytes:
+    """Return a trial as a table with a row for each state."""
+    trial = next((one.trial for one in workspace.trials() if one.trial.id == identity), None)
+    if trial is None:
+        raise unknown_trial(workspace, identity)
+    last = np.full((1, trial.inputs.shape[1]), np.nan)  # the last state has no input
+    times = trial.dt * np.arange(len(trial.states))[:, None]
+    rows = np.hstack([times, trial.states, np.vstack([trial.inputs, last])])
+    names, stream = ("t", *trial.state_names, *trial.input_names), io.BytesIO()
+    if form == "npz":
+        np.savez(stream, **dict(zip(names, rows.T, strict=True)))
+    else:
+        np.savetxt(stream, rows, fmt="%.10g", delimiter=",", header=",".join(names), comments="")
+    return stream.getvalue()
