@@ -11,7 +11,6 @@ import io
 import json
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,7 +23,6 @@ from grounded_trials.formats.protobuf import encode_doubles, encode_lists
 from grounded_trials.store.own_files import (
     CANDIDATE,
     Meta,
-    OwnFile,
     Units,
     read_own,
     stated,
@@ -51,6 +49,14 @@ def encoded_candidate(
     states, inputs = np.asarray(predicted_states, float), np.asarray(predicted_inputs, float)
     for array, shape in ((states, (H + 1, n)), (inputs, (H, m))):
         of_shape("prediction", array, shape)
+    about = {
+        "low": [None if v == -np.inf else v for v in policy.low.tolist()],
+        "high": [None if v == np.inf else v for v in policy.high.tolist()],
+        "past": policy.past.tolist(),
+        "depths": list(policy.depths),
+        "angles": [bool(a) for a in policy.angles],
+        "z": list(policy.z_names),
+    }
     table = stated(
         CANDIDATE,
         policy.dt,
@@ -58,7 +64,7 @@ def encoded_candidate(
         with_units(policy.input_names, input_units),
         meta,
         steps=str(H),
-        policy=json.dumps(_policy_table(policy)),
+        policy=json.dumps(about),
     )
     table["sha256"] = _hash(table, [*_controls(policy), states, inputs])
     times = np.rint(np.arange(H + 1) * policy.dt * 1e9).astype(np.int64)
@@ -94,7 +100,10 @@ def read_candidate(
     states, inputs = own.names("states"), own.names("inputs")
     table = own.json("policy", dict)
     n, m = len(states), len(inputs)
-    depths = _depths(own, own.floats(table.get("depths"), "policy.depths", m))
+    given = own.floats(table.get("depths"), "policy.depths", m)
+    if not ((given % 1 == 0) & (given >= 0) & (given <= WIDTH)).all():
+        raise own.bad("policy.depths", given.tolist(), must="whole", low=0, high=WIDTH)
+    depths = tuple(given.astype(int).tolist())
     nz = n + sum(depths)
     feedforward, gain, reference = own.lists(
         "/policy", {"feedforward": m, "gain": m * nz, "reference": nz}
@@ -153,23 +162,6 @@ def _hash(table: Meta, arrays: Iterable[Array]) -> str:
         digest.update(repr(array.shape).encode())
         digest.update(np.ascontiguousarray(array + 0.0, dtype="<f8").reshape(-1).data)
     return digest.hexdigest()
-
-
-def _depths(own: OwnFile, depths: Array) -> tuple[int, ...]:
-    if not ((depths % 1 == 0) & (depths >= 0) & (depths <= WIDTH)).all():
-        raise own.bad("policy.depths", depths.tolist(), must="whole", low=0, high=WIDTH)
-    return tuple(depths.astype(int).tolist())
-
-
-def _policy_table(policy: Policy) -> dict[str, Any]:
-    return {
-        "low": [None if v == -np.inf else v for v in policy.low.tolist()],
-        "high": [None if v == np.inf else v for v in policy.high.tolist()],
-        "past": policy.past.tolist(),
-        "depths": list(policy.depths),
-        "angles": [bool(a) for a in policy.angles],
-        "z": list(policy.z_names),
-    }
 
 
 def _refuse_faulty(policy: Policy, name: str = "candidate") -> None:

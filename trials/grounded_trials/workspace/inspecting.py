@@ -100,13 +100,10 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
     try:
         model = workspace.base_model
     except GroundedError as error:
-        here = (workspace.folder / FILE).exists()
         why = f": {error}"
-        if not here:
-            why = (
-                ", as this folder is no workspace: make one from the log, or name yours with -C DIR"
-            )
-        return Inspected(str(log), report, "", why, outside=not here)
+        if outside := not (workspace.folder / FILE).exists():
+            why = ", as this is no workspace: make one from the log, or name yours with -C DIR"
+        return Inspected(str(log), report, "", why, outside=outside)
     states, inputs = assigned(report, model.states, model.inputs, model)
     table = mapping_toml(states, inputs, simulated=report.simulated, layout=layout)
     odd = tuple(one.sentence for one in misread(model, workspace.log_mapping))
