@@ -118,20 +118,17 @@ class Folder:
 
     @cached_property
     def planner(self) -> Planner:
-        """The task in which the search plans, with all adopted effects."""
-        if not self.config.model.effects:
-            return self._believed(Planner(self.task, self.task))
-        from grounded_trials.workspace.adopted import planner_of
+        """The task in which the search plans, with all adopted effects and [model] priors."""
+        table, planner = self.config.model, Planner(self.task, self.task)
+        if table.effects:
+            from grounded_trials.workspace.adopted import planner_of
 
-        return self._believed(planner_of(self.task, self.config.model.effects))
-
-    def _believed(self, planner: Planner) -> Planner:
-        """Return the planner with the standard deviations of [model] priors."""
-        priors, model = self.config.model.priors, planner.plan.model
-        if not priors:
+            planner = planner_of(self.task, table.effects)
+        if not table.priors:
             return planner
-        known("parameter", priors, model.params, "the model", "grounded.toml: [model] priors")
-        own = {name: replace(model.params[name], std=std) for name, std in priors.items()}
+        model = planner.plan.model
+        known("parameter", table.priors, model.params, "the model", "grounded.toml: [model] priors")
+        own = {name: replace(model.params[name], std=std) for name, std in table.priors.items()}
         return planner.with_model(replace(model, params={**model.params, **own}))
 
     @cached_property
