@@ -143,8 +143,8 @@ class Folder:
         for stored in self.store.list():
             try:
                 if known.why_aside(stored) is None:
-                    one, group = self._whole(stored), known.groups.get(stored.digest, "")
-                    found.append(one.changed(group=group) if group else one)
+                    group = known.groups.get(stored.digest, "")
+                    found.append(self._whole(stored).within(group))
             except GroundedError as error:
                 errors.append(error)
                 broken.append(Lost(str(stored.path), str(error)))

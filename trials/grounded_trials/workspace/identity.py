@@ -73,10 +73,10 @@ class StoredTrial:
         """SHA-256 of the candidate file that it contains, "" for none."""
         return sha256(self.policy) if self.policy else ""
 
-    def changed(self, **about: Any) -> Self:
-        """Return it with another group."""
-        trial, measured = (replace(each, **about) for each in (self.trial, self.measured))
-        return replace(self, trial=trial, measured=measured)
+    def within(self, group: str) -> Self:
+        """Return it with the condition that it was run in."""
+        trial, measured = (replace(each, group=group) for each in (self.trial, self.measured))
+        return replace(self, trial=trial, measured=measured) if group else self
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,12 +242,10 @@ def named_trials(workspace: Folder, names: Sequence[str], usable: Sequence[str])
     if not usable:
         then = NextCommand("restore", (aside[-1],)) if aside else None
         raise refused("search.no_trial", *aside, then=then)
-    stored = {one.id for one in workspace.store.list()} - {*aside}
     for name in given:
-        if name.lower() in stored.difference(usable):
-            raise refused(
-                "search.unknown", name.lower(), kind="trial", unusable=True, known=ranges(usable)
-            )
-        if name.lower() not in usable:
+        if (low := name.lower()) not in usable:
+            if low in {one.id for one in workspace.store.list()}.difference(aside):
+                facts = {"unusable": True, "known": ranges(usable)}
+                raise refused("search.unknown", low, kind="trial", **facts)
             raise unknown_trial(workspace, name)
     return tuple(name.lower() for name in given)
