@@ -102,7 +102,8 @@ def inspect_in(workspace: Folder, log: str | Path, layout: Layout = AS_IT_SAYS) 
     except GroundedError as error:
         why = f": {error}"
         if outside := not (workspace.folder / FILE).exists():
-            why = ", as this is no workspace: make one from the log, or name yours with -C DIR"
+            why = ", as this folder is no workspace"
+            why += ": make one from the log, or name yours with -C DIR"
         return Inspected(str(log), report, "", why, outside=outside)
     states, inputs = assigned(report, model.states, model.inputs, model)
     table = mapping_toml(states, inputs, simulated=report.simulated, layout=layout)
