@@ -81,7 +81,8 @@ def _types(data: bytes) -> list[_Type]:
     while 0 <= at < end - 3:
         number = data[at + 2]
         length, after = lengths[number], at + lengths[number]
-        if data[at : at + 2] != HEAD or not length or after > end or not _goes_on(data, after):
+        goes_on = after >= end - 3 or data[after : after + 2] == HEAD  # or the log ends
+        if data[at : at + 2] != HEAD or not length or after > end or not goes_on:
             at = data.find(HEAD, at + 1)
             continue
         types[number].at.append(at)
@@ -94,11 +95,6 @@ def _types(data: bytes) -> list[_Type]:
         if number in types:
             types[number].units = units
     return [kind for number, kind in types.items() if number != FMT]
-
-
-def _goes_on(data: bytes, at: int) -> bool:
-    """Check whether a message begins there, or the log ends."""
-    return at >= len(data) - 3 or data[at : at + 2] == HEAD
 
 
 def _defined(body: bytes) -> _Type | None:

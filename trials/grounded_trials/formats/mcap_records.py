@@ -202,10 +202,6 @@ class Fields:
         except UnicodeDecodeError:
             raise BadRecord("decode", what="text") from None
 
-    def blob(self) -> bytes:
-        """Return the next bytes, which follow their length."""
-        return self.skip(self.uint(64))
-
     def table(self) -> dict[str, str]:
         """Return the next table of texts."""
         inner = Fields(self.skip(self.uint(32)))
@@ -223,7 +219,7 @@ def _channel(f: Fields) -> Channel:
 
 def _attachment(f: Fields) -> Attachment:
     log_time, create_time = f.uint(64), f.uint(64)
-    attachment = Attachment(f.text(), f.text(), f.blob(), log_time, create_time)
+    attachment = Attachment(f.text(), f.text(), f.skip(f.uint(64)), log_time, create_time)
     end = f.pos
     stated = f.uint(32)
     if stated and zlib.crc32(f.content[:end]) != stated:

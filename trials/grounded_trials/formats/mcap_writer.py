@@ -14,13 +14,7 @@ from struct import Struct, pack
 from typing import IO
 from zlib import crc32
 
-from grounded_trials.formats.mcap_records import (
-    MAGIC,
-    MESSAGE_HEADER,
-    Header,
-    Messages,
-    Op,
-)
+from grounded_trials.formats.mcap_records import MAGIC, MESSAGE_HEADER, Header, Messages, Op
 from grounded_trials.formats.protobuf import file_descriptor_set
 
 LIBRARY = "grounded"
@@ -47,11 +41,8 @@ class McapWriter:
         self.channels: list[bytes] = []
         self.counts: dict[int, int] = {}  # messages by channel
         self.times: list[int] = []  # first and last of each chunk [ns]
-        self.indices: dict[int, list[bytes]] = {
-            Op.CHUNK_INDEX: [],
-            Op.ATTACHMENT_INDEX: [],
-            Op.METADATA_INDEX: [],
-        }
+        kinds = (Op.CHUNK_INDEX, Op.ATTACHMENT_INDEX, Op.METADATA_INDEX)
+        self.indices: dict[int, list[bytes]] = {kind: [] for kind in kinds}
         self._new_chunk()
         self._put(MAGIC)
         self._put(_record(Op.HEADER, _text(header.profile), _text(header.library)))
@@ -186,10 +177,14 @@ class McapWriter:
         """Write the chunk and its indexes, if it has messages."""
         if not self.entries:
             return
-        data, kind = b"".join(self.chunk), "zstd" * self.compressed
-        packed = _compressed(data) if kind else data
-        times = [min(map(min, (e[::2] for e in self.entries.values())))]
-        times.append(max(map(max, (e[::2] for e in self.entries.values()))))
+        packed = data = b"".join(self.chunk)
+        kind = "zstd" * self.compressed
+        if kind:
+            import zstandard
+
+            packed = zstandard.compress(data)
+        stamps = [e[::2] for e in self.entries.values()]
+        times = min(map(min, stamps)), max(map(max, stamps))
         self.times += times
         span, sizes, start = pack("<QQ", *times), pack("<QQ", len(packed), len(data)), self.at
         head = pack("<QI", len(data), crc32(data)) + _text(kind) + pack("<Q", len(packed))
@@ -205,12 +200,6 @@ class McapWriter:
             _record(Op.CHUNK_INDEX, span, where, _text(kind), sizes)
         )
         self._new_chunk()
-
-
-def _compressed(data: bytes) -> bytes:
-    import zstandard
-
-    return zstandard.compress(data)
 
 
 def _record(opcode: int, *parts: bytes) -> bytes:

@@ -125,7 +125,9 @@ def _recover(source: Path, target: Path) -> Recovery:
                             homeless += len(own)
                             continue
                         if identity not in numbers:
-                            numbers[identity] = _opened(copy, channel, schema)
+                            kind = schema and copy.schema(schema.name, schema.encoding, schema.data)
+                            opened = channel.topic, channel.encoding, kind or 0, channel.metadata
+                            numbers[identity] = copy.channel(*opened)
                         copy.messages(own, numbers[identity])
                         saved[channel.topic] += len(own)
                         ends += [int(own.log_times.min()), int(own.log_times.max())]
@@ -163,12 +165,6 @@ def _recover(source: Path, target: Path) -> Recovery:
         complete=not losses,
         format=meta.get("format", ""),
     )
-
-
-def _opened(copy: McapWriter, channel: Channel, schema: Schema | None) -> int:
-    """Open a channel as it was read; return its number in the copy."""
-    number = copy.schema(schema.name, schema.encoding, schema.data) if schema else 0
-    return copy.channel(channel.topic, channel.encoding, number, channel.metadata)
 
 
 _SPAN = Struct("<QQ")  # a chunk's first and last time

@@ -47,12 +47,10 @@ class Example:
         return import_module(self.model)
 
 
-def _examples() -> dict[str, Example]:
-    text = files(__package__).joinpath("examples.toml").read_text("utf-8")
-    return {name: Example(**given) for name, given in tomllib.loads(text).items()}
-
-
-EXAMPLES: Mapping[str, Example] = _examples()
+_TEXT = files(__package__).joinpath("examples.toml").read_text("utf-8")
+EXAMPLES: Mapping[str, Example] = {
+    name: Example(**given) for name, given in tomllib.loads(_TEXT).items()
+}
 
 
 def example(name: str) -> Example:

@@ -11,7 +11,7 @@ own unit (`pushed`), and `gain` is the speed per unit of it that the log shows (
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from grounded.checks import refused, unknown
@@ -57,12 +57,6 @@ def moving(log: LogReport) -> dict[str, FieldReport]:
             name = _word(one.path)
             found.setdefault(_in_group(one.path) if name in found else name, one)
     return found
-
-
-def called_input(name: str, path: str, beside: Collection[str]) -> bool:
-    """Return whether more in a number's name, beside all names, speaks for a command than not."""
-    speaks_for = bool(COMMANDED.search(path.lower())) + bool(SIDES.search(name))
-    return speaks_for > (name == SURGE[0] and {*beside} >= SURGE[1])
 
 
 def generic(clues: Clues, inputs: Sequence[str] = ()) -> Skeleton:
@@ -160,10 +154,12 @@ class Clues:
 
     def __init__(self, log: LogReport) -> None:
         self.log, self.found, self.joints = log, moving(log), joint_names(log)
-        self.sent = {  # the paths of the numbers that are named like commands
+        # the paths of the numbers whose names, beside all others, speak for a command
+        ahead = SURGE[0] if {*self.found} >= SURGE[1] else ""
+        self.sent = {
             name: one.path
             for name, one in self.found.items()
-            if called_input(name, one.path, self.found)
+            if bool(COMMANDED.search(one.path.lower())) + bool(SIDES.search(name)) > (name == ahead)
         }
         # the joints that are not all wheels
         self.arms = {
