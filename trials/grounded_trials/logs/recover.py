@@ -102,8 +102,8 @@ def _recover(source: Path, target: Path) -> Recovery:
             schemas.setdefault(record.id, record)
 
     # The copy.
-    salvage, numbers, meta = Salvage(data), dict[int, int](), dict[str, str]()
-    saved, ends, homeless, anything = Counter[str](), list[int](), 0, False
+    salvage, meta, ends, homeless = Salvage(data), dict[str, str](), list[int](), 0
+    saved, numbers, anything = Counter[str](), dict[int, int](), False
     try:
         with target.open("xb") as out:
             packed = any(name in data[:HEAD] for name in COMPRESSED)
@@ -117,20 +117,17 @@ def _recover(source: Path, target: Path) -> Recovery:
                     meta = record.data if record.name == "grounded" else meta
                 elif isinstance(record, Attachment):
                     copy.attachment(**vars(record))
-                elif isinstance(record, Messages):
-                    for identity in record.channel_ids():
-                        own, channel = record.of(identity), channels.get(identity)
-                        schema = schemas.get(channel.schema_id) if channel else None
-                        if channel is None or (schema is None and channel.schema_id):
-                            homeless += len(own)
-                            continue
-                        if identity not in numbers:
-                            kind = schema and copy.schema(schema.name, schema.encoding, schema.data)
-                            opened = channel.topic, channel.encoding, kind or 0, channel.metadata
-                            numbers[identity] = copy.channel(*opened)
-                        copy.messages(own, numbers[identity])
-                        saved[channel.topic] += len(own)
-                        ends += [int(own.log_times.min()), int(own.log_times.max())]
+                for own in _by_channel(record):
+                    channel = channels.get(identity := int(own.channels[0]))
+                    schema = schemas.get(channel.schema_id) if channel else None
+                    if channel is None or (schema is None and channel.schema_id):
+                        homeless += len(own)
+                        continue
+                    if identity not in numbers:
+                        numbers[identity] = _opened(copy, channel, schema)
+                    copy.messages(own, numbers[identity])
+                    saved[channel.topic] += len(own)
+                    ends += [int(own.log_times.min()), int(own.log_times.max())]
             if copy is not None:
                 copy.finish()
         sync_folder(target.parent)
@@ -165,6 +162,19 @@ def _recover(source: Path, target: Path) -> Recovery:
         complete=not losses,
         format=meta.get("format", ""),
     )
+
+
+def _by_channel(record: Record) -> list[Messages]:
+    """Return the messages of a record, of one channel each; [] of another record."""
+    if not isinstance(record, Messages):
+        return []
+    return [record.of(identity) for identity in record.channel_ids()]
+
+
+def _opened(copy: McapWriter, channel: Channel, schema: Schema | None) -> int:
+    """Open a channel as it was read; return its number in the copy."""
+    number = copy.schema(schema.name, schema.encoding, schema.data) if schema else 0
+    return copy.channel(channel.topic, channel.encoding, number, channel.metadata)
 
 
 _SPAN = Struct("<QQ")  # a chunk's first and last time
