@@ -10,53 +10,33 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import BinaryIO, Concatenate, ParamSpec, TypeVar
 
 from grounded.checks import refused
 from grounded.errors import GroundedError, needs
-from grounded_trials.formats import dataflash
 from grounded_trials.formats.bags import ZSTD, decompressed
 from grounded_trials.formats.lerobot import is_episode
 from grounded_trials.formats.mcap_records import MAGIC, Channel, Messages, Record, Rows
 from grounded_trials.formats.mcap_walk import mapped, read_records
 from grounded_trials.formats.tables import AS_IT_SAYS, Layout, table_records
 from grounded_trials.formats.text_tables import SUFFIXES
-from grounded_trials.logs.log_paths import empty, log_files, on_disk, open_log
+from grounded_trials.logs.log_paths import (
+    CSV,
+    EPISODE,
+    FORMATS,
+    Format,
+    empty,
+    log_files,
+    on_disk,
+    open_log,
+)
 from grounded_trials.plain_file import unreadable
 from grounded_trials.within import within
 
 P = ParamSpec("P")
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Format:
-    """A log format: how its files begin, and what reads them."""
-
-    kind: str  # its name in messages
-    begins: bytes  # the first bytes of a file
-    reader: str  # module of `formats`, and its function
-    writes: str = ""  # of tables (path, layout) -> Tables: the kind of their types; "": (path)
-    library: str = ""  # that the reader needs
-    extra: str = ""  # of grounded's, with which the library comes
-
-
-CSV = Format("table", b"", "text_tables.csv_tables", "csv")
-PYARROW = "pyarrow.parquet", "parquet"
-EPISODE = Format("LeRobot data set", b"", "parquet.episode_tables", "lerobot", *PYARROW)
-FORMATS = (
-    Format("ROS 2 bag", b"SQLite format 3\0", "bags.sqlite_records"),
-    Format("ROS 1 bag", b"#ROSBAG", "bags.ros1_records"),
-    Format("PX4 log", b"ULog\x01\x12\x35", "tables.ulog_tables", "ulog", "pyulog", "px4"),
-    Format("NumPy archive", b"PK\x03\x04", "tables.npz_tables", "npz"),
-    Format("ArduPilot log", dataflash.BEGINS, "dataflash.dataflash_tables", "dataflash"),
-    Format("MATLAB file", b"MATLAB 5.0", "mat.mat_tables", "mat", "scipy.io"),
-    Format("MATLAB file", b"MATLAB 7.3", "mat.mat73_tables", "mat", "h5py", "matlab"),
-    Format("parquet table", b"PAR1", "parquet.parquet_tables", "parquet", *PYARROW),
-)
 
 
 def log_records(path: Path, layout: Layout = AS_IT_SAYS) -> Iterator[Record]:

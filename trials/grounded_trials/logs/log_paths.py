@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,8 +16,35 @@ from grounded.errors import GroundedError, alike
 from grounded_trials.formats import lerobot
 from grounded_trials.plain_file import open_file, read_file, unreadable
 
+
+@dataclass(frozen=True)
+class Format:
+    """A log format other than MCAP: how its files are called and begin, and what reads them."""
+
+    kind: str  # its name in messages
+    suffix: str
+    begins: bytes  # the first bytes of a file
+    reader: str  # module of `formats`, and its function
+    writes: str = ""  # of tables (path, layout) -> Tables: the kind of their types; "": (path)
+    library: str = ""  # that the reader needs
+    extra: str = ""  # of grounded's, with which the library comes
+
+
+CSV = Format("table", ".csv", b"", "text_tables.csv_tables", "csv")
+PYARROW = "pyarrow.parquet", "parquet"
+EPISODE = Format("LeRobot data set", "", b"", "parquet.episode_tables", "lerobot", *PYARROW)
+FORMATS = (
+    Format("ROS 2 bag", ".db3", b"SQLite format 3\0", "bags.sqlite_records"),
+    Format("ROS 1 bag", ".bag", b"#ROSBAG", "bags.ros1_records"),
+    Format("PX4 log", ".ulg", b"ULog\x01\x12\x35", "tables.ulog_tables", "ulog", "pyulog", "px4"),
+    Format("NumPy archive", ".npz", b"PK\x03\x04", "tables.npz_tables", "npz"),
+    Format("ArduPilot log", ".bin", b"\xa3\x95\x80", "dataflash.dataflash_tables", "dataflash"),
+    Format("MATLAB file", ".mat", b"MATLAB 5.0", "mat.mat_tables", "mat", "scipy.io"),
+    Format("MATLAB file", ".mat", b"MATLAB 7.3", "mat.mat73_tables", "mat", "h5py", "matlab"),
+    Format("parquet table", ".parquet", b"PAR1", "parquet.parquet_tables", "parquet", *PYARROW),
+)
 BAGS = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")  # files of a bag's folder
-KINDS = (*BAGS, ".bag", ".csv", ".npz", ".ulg", ".bin", ".mat", ".parquet")
+KINDS = (*BAGS, *(one.suffix for one in (CSV, *FORMATS)))
 NAMED = 3  # most tables named of a folder that is no log
 LISTING_LIMIT = 2**24  # [bytes] of a metadata.yaml
 _LISTED = re.compile(

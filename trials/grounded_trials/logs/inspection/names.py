@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from importlib.resources import files
 
 from grounded_trials.logs.inspection.inspect_log import FieldReport, TopicReport
+from grounded_trials.logs.log_paths import CSV, FORMATS
 from grounded_trials.logs.stated_units import bare_command, without_role, without_unit
 
 MEASURED = ("/Odometry", "/Imu")  # messages that hold no commands
@@ -31,7 +32,8 @@ PARTS = re.compile(
 )
 POSES = ("/PoseStamped", "/PoseWithCovarianceStamped", "/TransformStamped")
 _WORD = re.compile(r"[a-z]+")
-TABLES = ("npz", "csv", "parquet", "mat", "run")  # topics of tables: a column's name says it all
+# topics of tables: a column's name says it all
+TABLES = {"run", *(one.writes for one in (CSV, *FORMATS) if one.writes)}
 WORTH, LESS = 4.0, 0.3  # points of the usual name, less of each further one
 
 
