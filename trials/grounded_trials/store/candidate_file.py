@@ -101,7 +101,7 @@ def read_candidate(
     table = own.json("policy", dict)
     n, m = len(states), len(inputs)
     given = own.floats(table.get("depths"), "policy.depths", m)
-    if not ((given % 1 == 0) & (given >= 0) & (given <= WIDTH)).all():
+    if not ((given == np.round(given)) & (given >= 0) & (given <= WIDTH)).all():
         raise own.bad("policy.depths", given.tolist(), must="whole", low=0, high=WIDTH)
     depths = tuple(given.astype(int).tolist())
     nz = n + sum(depths)
