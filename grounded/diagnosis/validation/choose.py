@@ -102,18 +102,18 @@ class Rule:
         self.options, self.gain, self.nats, self.less = list(options), gain, nats, less
         self.held_out = held_out
         self.outset = outset or next(o.errors for o in options if not o.causes)
-        self._unsupported: dict[frozenset[str], list[str]] = {}
+        self._need: dict[tuple[frozenset[str], str], bool] = {}
 
     def choose(self) -> Choice:
         """Return the smallest supported set that predicts as well as the best one."""
         none = next(option for option in self.options if not option.causes)
         if not self.held_out:
             by = sorted(self.options, key=lambda option: -self.nats(none, option))
-            likeliest = next(option for option in by if not self.unsupported(option))
+            likeliest = next(option for option in by if self.supported(option))
             return Choice(likeliest, likeliest, 0.0, 0.0)
         by = sorted(self.options, key=self.gained, reverse=True)
-        reference = next(option for option in by if not self.unsupported(option))
-        near = [o for o in by if not (self.better(o, reference) or self.unsupported(o))]
+        reference = next(option for option in by if self.supported(option))
+        near = [o for o in by if not self.better(o, reference) and self.supported(o)]
         claims = [(option, claim) for option in near if (claim := self._claimed(option))]
         least = min(len(option.causes) for option, _ in claims)
         small = [pair for pair in claims if len(pair[0].causes) == least]
@@ -125,12 +125,13 @@ class Rule:
 
     def _claimed(self, option: Option) -> Option | None:
         """Return a set, or its calibrated form, if it predicts no worse than no effects do."""
-        bare = [o for o in self.options if o.causes <= {CALIBRATION} and not self.unsupported(o)]
+        bare = [o for o in self.options if o.causes <= {CALIBRATION} and self.supported(o)]
         least = max(map(self.gained, bare)) - LEAST
         calibrated = (o for o in self.options if o.causes == option.causes | {CALIBRATION})
         for claim in (option, *calibrated):
-            effects_supported = {*self.unsupported(claim)} <= {CALIBRATION}
-            if effects_supported and (claim in bare or self.gained(claim) >= least):
+            if claim not in bare and self.gained(claim) < least:
+                continue
+            if self.supported(claim, claim.causes - {CALIBRATION}):
                 return claim
         return None
 
@@ -138,17 +139,14 @@ class Rule:
         """Return the gain since the outset."""
         return self.gain(self.outset, option.errors).mean
 
-    def unsupported(self, option: Option) -> list[str]:
-        """Return the causes of a set that it does not need, or that a guard refuses."""
-        known = self._unsupported.get(option.causes)
-        if known is None:
-            known = [c for c in sorted(option.causes) if not self._needed(option, c)]
-            self._unsupported[option.causes] = known
-        return known
+    def supported(self, option: Option, causes: frozenset[str] | None = None) -> bool:
+        """Check whether a set needs each of some of its causes (None: of all)."""
+        asked = sorted(option.causes if causes is None else causes)
+        return all(self._needed(option, cause) for cause in asked)
 
-    def refuse(self, option: Option, causes: list[str]) -> None:
+    def refuse(self, option: Option, causes: Sequence[str]) -> None:
         """Take some causes of a set for unsupported from now on."""
-        self._unsupported[option.causes] = causes
+        self._need |= dict.fromkeys(((option.causes, c) for c in causes), False)
 
     def better(self, before: Option, after: Option) -> bool:
         """Check whether one set predicts better than another, and evidence does not contradict."""
@@ -163,11 +161,16 @@ class Rule:
         return self.nats(before, after) > -PICKED
 
     def _needed(self, option: Option, cause: str) -> bool:
-        less = self.less(option, cause)
-        if less is None or not self.better(less, option):
-            return False
-        more = self.gain(less.errors, option.errors).mean
-        return not self.held_out or more >= SHARE * max(self.gained(option), 0.0)
+        """Check whether a set is better with a cause, by enough of what it gains."""
+        known = self._need.get((option.causes, cause))
+        if known is None:
+            less = self.less(option, cause)
+            known = less is not None and self.better(less, option)
+            if less is not None and known and self.held_out:
+                more = self.gain(less.errors, option.errors).mean
+                known = more >= SHARE * max(self.gained(option), 0.0)
+            self._need[option.causes, cause] = known
+        return known
 
 
 @dataclass(frozen=True, eq=False)
