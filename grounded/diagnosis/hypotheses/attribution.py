@@ -150,7 +150,8 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         best = varied(search, best)
         floor = search.score(best) - BEHIND
         others = search.of_size(size)[: RIVALS if size == 1 else 1]
-        for start in (best, *(f for f in others if f is not best and search.score(f) > floor)):
+        near = [f for f in others if f is not best and search.score(f) > floor]
+        for start in (best, *near, *search.exact(best)):
             search.extended(start, SOME)
         size += 1
         search.refined(search.of_size(size)[:HOPEFUL], 10)

@@ -180,6 +180,15 @@ class HypothesisSearch(FittedHypotheses):
             found += self.refined([(crude, found[-1].noise, found[-1].track)], iterations=10)
         return found
 
+    def exact(self, fit: Fitted) -> list[Fitted]:
+        """Return the likeliest fit with exact parameters of the effects of a calibrated fit.
+
+        What calibration explains with all parameters may be one of them, or one more effect.
+        """
+        own = {*fit.hypothesis.names}
+        same = [f for (_, w, names), f in self.fits.items() if w == 0 and {*names} == own]
+        return sorted(same, key=self.score)[-1:] if fit.hypothesis.spread > 0 else []
+
     def far(self, fit: Fitted) -> bool:
         """Check whether a parameter has moved by more than its prior standard deviation."""
         h, unit = fit.hypothesis, self.data.model.spreads
