@@ -144,7 +144,11 @@ class HypothesisSearch(FittedHypotheses):
 
     def anew(self, fit: Fitted, effect: Effect, values: Mapping[str, float]) -> Start:
         """Return a `fresh` start of a fit's hypothesis with one more effect."""
-        h, noise, track = self.fresh(fit.hypothesis.plus(effect, values))
+        return self.fresh_as(fit, fit.hypothesis.plus(effect, values))
+
+    def fresh_as(self, fit: Fitted, h: Hypothesis) -> Start:
+        """Return a `fresh` start of a hypothesis, with the noise structure and weights of a fit."""
+        h, noise, track = self.fresh(h)
         noise = noise.allowing(fit.noise.structure, self.data.dt)
         weight_w, weight_v = fit.noise.weight_w, fit.noise.weight_v
         return h, replace(noise, weight_w=weight_w, weight_v=weight_v), track

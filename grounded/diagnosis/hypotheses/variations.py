@@ -4,6 +4,7 @@ A set that grew one effect at a time may blame more than it needs, or name an ef
 one contains. So it is varied, and every variation is fitted until it converges:
 
     one for several effects of single inputs become one of several inputs (`delay:a+b`)
+    late sensor     a filtered log becomes a delayed one, or the other way round
     fewer inputs    an effect of several inputs becomes one of some of them, or one of each
     plain friction  a richer friction of a joint becomes its plain dry friction
 """
@@ -17,6 +18,7 @@ import numpy as np
 
 from grounded.diagnosis.hypotheses.search import TO_THE_TOP, HypothesisSearch
 from grounded.diagnosis.levels import NATS
+from grounded.diagnosis.likelihood.delays import delayed
 from grounded.diagnosis.likelihood.fitted import Fitted
 from grounded.diagnosis.likelihood.hypothesis import Hypothesis
 from grounded.effects import Effect, InputFamily, MemoryFamily
@@ -39,7 +41,8 @@ def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
     for h in variations(search, fit.hypothesis):
         if (names := frozenset(h.names)) not in known or names == frozenset(fit.hypothesis.names):
             known.add(names)
-            starts.append((h, fit.noise, fit.track))
+            late = delayed(h.effects) != delayed(fit.hypothesis.effects)
+            starts.append(search.fresh_as(fit, h) if late else (h, fit.noise, fit.track))
     found = search.refined(starts, TO_THE_TOP)
     size = len(fit.hypothesis.effects)
     small = [f for f in map(search.latest, found) if len(f.hypothesis.effects) <= size]
@@ -50,7 +53,7 @@ def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
 def variations(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
     """Yield a set with one effect for several, with fewer inputs, and with plain frictions."""
     own = {effect.name: effect for effect in search.candidates}
-    for change in (*merged(own, h), *parted(own, h), *plainer(search, h)):
+    for change in (*merged(own, h), *parted(own, h), *relogged(own, h), *plainer(search, h)):
         yield in_place(h, change)
 
 
@@ -101,6 +104,15 @@ def parted(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
             if later.family.name in LATE and one is not None and other is not None:
                 longer = {"d": values["d"] + more.get("d", more.get("tau", 0.0))}
                 yield {effect.name: ((one, values),), later.name: ((other, longer),)}
+
+
+def relogged(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
+    """Yield a delay in place of a filter of one sensor, and the other way round, as late."""
+    kinds = {"sensor_delay": "sensor_lag", "sensor_lag": "sensor_delay"}
+    for effect, values in h.pairs:
+        other = own.get(kinds.get(effect.family.name, "") + ":" + "+".join(effect.site.targets))
+        if other is not None and not effect.known:
+            yield {effect.name: ((other, {other.free[0].name: values[effect.free[0].name]}),)}
 
 
 def plainer(search: HypothesisSearch, h: Hypothesis) -> Iterator[Change]:
