@@ -4,7 +4,7 @@ A set that grew one effect at a time may blame more than it needs, or name an ef
 one contains. So it is varied, and every variation is fitted until it converges:
 
     one for several effects of single inputs become one of several inputs (`delay:a+b`)
-    late sensor     a filtered log becomes a delayed one, or the other way round
+    late            a delay becomes a filter, of a sensor or of inputs, or the other way round
     fewer inputs    an effect of several inputs becomes one of some of them, or one of each
     plain friction  a richer friction of a joint becomes its plain dry friction
 """
@@ -27,6 +27,8 @@ from grounded.effects.drive import motion_of, push
 from grounded.effects.joint import joint_friction, load_friction
 
 HOPEFUL = 4  # best sets of a size that are fitted to convergence
+AS_LATE = {"sensor_delay": "sensor_lag", "delay": "first_order_lag"}
+AS_LATE |= {lag: delay for delay, lag in AS_LATE.items()}
 LATE = ("delay", "first_order_lag", "rate_limit")  # one of all inputs replaces any of these
 
 Change = Mapping[
@@ -53,7 +55,7 @@ def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
 def variations(search: HypothesisSearch, h: Hypothesis) -> Iterator[Hypothesis]:
     """Yield a set with one effect for several, with fewer inputs, and with plain frictions."""
     own = {effect.name: effect for effect in search.candidates}
-    for change in (*merged(own, h), *parted(own, h), *relogged(own, h), *plainer(search, h)):
+    for change in (*merged(own, h), *parted(own, h), *as_late(own, h), *plainer(search, h)):
         yield in_place(h, change)
 
 
@@ -106,11 +108,10 @@ def parted(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
                 yield {effect.name: ((one, values),), later.name: ((other, longer),)}
 
 
-def relogged(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
-    """Yield a delay in place of a filter of one sensor, and the other way round, as late."""
-    kinds = {"sensor_delay": "sensor_lag", "sensor_lag": "sensor_delay"}
+def as_late(own: Mapping[str, Effect], h: Hypothesis) -> Iterator[Change]:
+    """Yield a delay in place of a filter of the same sensor or inputs, or the other way round."""
     for effect, values in h.pairs:
-        other = own.get(kinds.get(effect.family.name, "") + ":" + "+".join(effect.site.targets))
+        other = own.get(f"{AS_LATE.get(effect.family.name)}:{'+'.join(effect.site.targets)}")
         if other is not None and not effect.known:
             yield {effect.name: ((other, {other.free[0].name: values[effect.free[0].name]}),)}
 

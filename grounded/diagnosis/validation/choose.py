@@ -15,7 +15,9 @@ where its values were not fitted (`ruler`, by group of trials). The rule has fou
        A set that predicts worse than the model without effects, calibrated or not, is claimed with
        calibrated parameters, or not at all if that predicts worse, too.
     4. Of those that are as small, the likeliest. Within NATS nats they tie: then a parameter comes
-       before a mechanism, and that before what has no mechanism (`Option.order`).
+       before a mechanism, and that before what has no mechanism, what acts on one input before
+       what acts on several (`Option.order`). A supported set that is no larger replaces the
+       choice if it predicts better and is likelier by NATS.
 
 A cause is an effect, or the calibration of the model's own parameters. `benchmarks/decide.py` draws
 each number's curve.
@@ -53,12 +55,13 @@ class Option:
     Args:
         causes: names of its effects, and "calibration" if the parameters are free.
         errors: held-out errors.
-        order: of its causes: 0 a parameter, 1 a mechanism, 2 without a mechanism, summed up.
+        order: of its causes, summed up: 0 a parameter, 1 a mechanism, 2 without a mechanism; then
+            the number of states or inputs that they act on.
     """
 
     causes: frozenset[str]
     errors: Errors
-    order: int = 0
+    order: tuple[int, int] = (0, 0)
 
     @property
     def size(self) -> int:
@@ -120,8 +123,18 @@ class Rule:
         nats = {option.causes: self.nats(none, option) for option, _ in small}
         tied = [pair for pair in small if nats[pair[0].causes] > max(nats.values()) - NATS]
         _, chosen = min(tied, key=lambda pair: (pair[0].order, -nats[pair[0].causes]))
+        chosen = self._surpassed(chosen)
         apart = self.gain(chosen.errors, reference.errors)
         return Choice(chosen, reference, apart.mean, apart.paired[1])
+
+    def _surpassed(self, chosen: Option) -> Option:
+        """Return the likeliest supported set, no larger, that predicts better and is likelier."""
+        least = self.gained(chosen)
+        small = [o for o in self.options if o.size <= chosen.size and self.gained(o) > least]
+        likelier = [o for o in small if self.nats(chosen, o) > NATS and self.supported(o)]
+        if not likelier:
+            return chosen
+        return self._surpassed(max(likelier, key=lambda option: self.nats(chosen, option)))
 
     def _claimed(self, option: Option) -> Option | None:
         """Return a set, or its calibrated form, if it predicts no worse than no effects do."""

@@ -211,10 +211,9 @@ class Options:
         """Return a set of causes as an option."""
         if own not in self._known:
             fit = self.fits[own]
-            order = sum(
-                0 if isinstance(e.family, ParamFamily) or e.known else 1 + e.family.loose
-                for e in fit.hypothesis.effects
-            )
+            new = [e for e in fit.hypothesis.effects if not e.known]
+            new = [e for e in new if not isinstance(e.family, ParamFamily)]
+            order = sum(1 + e.family.loose for e in new), sum(len(e.site.targets) for e in new)
             self._known[own] = Option(own, self.ruler.errors(fit), order)
         return self._known[own]
 
