@@ -27,12 +27,12 @@ COMPARE = Comparison([0], np.full((2, 1), 1e-6), np.arange(TRIALS))
 NATS = {}  # evidence by option
 
 
-def option(causes, nats, rms, order=0, scatter=0.0):
+def option(causes, nats, rms, order=0, scatter=0.0, sites=1):
     """A set of causes with an rms error, of each trial or differing by `scatter` of it."""
     apart = 1 + scatter * np.cos(np.arange(TRIALS) * 2.5)
     total = np.tile((np.array(rms) * apart) ** 2, (2, 1))[..., None]
     errors = Errors(total, np.ones_like(total))
-    made = Option(frozenset(causes.split()), errors, order)
+    made = Option(frozenset(causes.split()), errors, (order, sites))
     NATS[made] = nats
     return made
 
@@ -78,6 +78,9 @@ DRAG, BIAS = option("drag", 80.0, 0.3), option("bias", 30.0, 0.8)
         ([NONE, DRAG, option("calibration", 90.0, 0.2)], "calibration"),
         ([NONE, option("drag", 80.0, 0.3, order=1), option("mass", 78.0, 0.3)], "mass"),
         ([NONE, option("wave", 80.0, 0.3, order=2), option("drag", 78.0, 0.3, order=1)], "drag"),
+        ([NONE, option("both", 80.0, 0.3, sites=2), option("left", 78.0, 0.3)], "left"),
+        # a smaller error is not sure, but the set is likelier and no larger
+        ([NONE, option("drag", 80.0, 0.3), option("lag", 90.0, 0.299)], "lag"),
         ([NONE, option("wave", 90.0, 0.3, order=2), option("drag", 78.0, 0.3, order=1)], "wave"),
     ],
 )
