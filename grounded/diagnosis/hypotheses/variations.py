@@ -37,14 +37,22 @@ Change = Mapping[
 
 
 def varied(search: HypothesisSearch, fit: Fitted) -> Fitted:
-    """Fit the variations of a set; return the likeliest that is not larger, or the set itself."""
-    known = {frozenset(fit.hypothesis.names)}
+    """Fit the variations of a set; return the likeliest that is not larger, or the set itself.
+
+    Those of other effects that have converged are not fitted again.
+    """
+    own, noise = frozenset(fit.hypothesis.names), fit.noise
+    known = {
+        frozenset(names)
+        for (structure, spread, names), f in search.fits.items()
+        if f.settled and (structure, spread) == (noise.structure, fit.hypothesis.spread)
+    }
     starts = []
     for h in variations(search, fit.hypothesis):
-        if (names := frozenset(h.names)) not in known or names == frozenset(fit.hypothesis.names):
+        if (names := frozenset(h.names)) not in known or names == own:
             known.add(names)
             late = delayed(h.effects) != delayed(fit.hypothesis.effects)
-            starts.append(search.fresh_as(fit, h) if late else (h, fit.noise, fit.track))
+            starts.append(search.fresh_as(fit, h) if late else (h, noise, fit.track))
     found = search.refined(starts, TO_THE_TOP)
     size = len(fit.hypothesis.effects)
     small = [f for f in map(search.latest, found) if len(f.hypothesis.effects) <= size]
