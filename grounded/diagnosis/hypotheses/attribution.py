@@ -151,11 +151,14 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         floor = search.score(best) - BEHIND
         others = search.of_size(size)[: RIVALS if size == 1 else 1]
         near = [f for f in others if f is not best and search.score(f) > floor]
-        for start in (best, *near, *search.exact(best)):
+        calibrates = best.hypothesis.spread > 0
+        for start in (best, *near, *(search.exact(best) if calibrates else ())):
             search.extended(start, SOME)
         size += 1
-        search.refined(search.of_size(size)[:HOPEFUL], 10)
-        search.refined(search.of_size(size)[:TOP], TO_THE_TOP)
+        for exact in (False, True)[: 1 + calibrates]:
+            search.refined(search.of_size(size, exact=exact)[:HOPEFUL], 10)
+            search.refined(search.of_size(size, exact=exact)[:TOP], TO_THE_TOP)
+            search.shrunk(search.of_size(size, exact=exact)[:TOP])
         for fit in search.of_size(size)[:TOP]:
             search.calibrated(fit)
         larger = search.of_size(size)

@@ -138,14 +138,12 @@ class FittedHypotheses:
         spread = best.hypothesis.spread
         return spread > 0 and self.score(best) > self.score(self.exact_null()) + NATS
 
-    def of_size(self, count: int) -> list[Fitted]:
-        """Return the best fit of each set of `count` effects, best first."""
+    def of_size(self, count: int, *, exact: bool = False) -> list[Fitted]:
+        """Return the best fit of each set of `count` effects (with exact parameters), in order."""
         best: dict[tuple[str, ...], Fitted] = {}
-        for (_, _, names), fit in self.fits.items():
-            if len(names) == count and (
-                names not in best or self.score(fit) > self.score(best[names])
-            ):
-                best[names] = fit
+        for (_, spread, names), fit in self.fits.items():
+            if len(names) == count and not (exact and spread > 0):
+                best[names] = max(best.get(names, fit), fit, key=self.score)
         return sorted(best.values(), key=lambda f: -self.score(f))
 
     def chosen(self, most: int) -> Fitted:

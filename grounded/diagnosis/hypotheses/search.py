@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from grounded.checks import refused
-from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric
+from grounded.diagnosis.hypotheses.explored import FittedHypotheses, parametric, sizeless
 from grounded.diagnosis.hypotheses.scan import Look, scan_candidates
 from grounded.diagnosis.likelihood.data import Data
 from grounded.diagnosis.likelihood.delays import delayed
@@ -189,9 +189,20 @@ class HypothesisSearch(FittedHypotheses):
 
         What calibration explains with all parameters may be one of them, or one more effect.
         """
-        own = {*fit.hypothesis.names}
-        same = [f for (_, w, names), f in self.fits.items() if w == 0 and {*names} == own]
-        return sorted(same, key=self.score)[-1:] if fit.hypothesis.spread > 0 else []
+        own, most = {*fit.hypothesis.names}, len(fit.hypothesis.names)
+        return [f for f in self.of_size(most, exact=True) if {*f.hypothesis.names} == own]
+
+    def shrunk(self, fits: Sequence[Fitted]) -> None:
+        """Fit sets without an effect of no size again, if they are less likely than with it.
+
+        They stopped beside their maximum, as fits at kinks may, and start from the larger set's.
+        """
+        for fit in fits:
+            for name in sizeless(fit.hypothesis, self.sure(fit)[0]):
+                start = fit.hypothesis.minus(name), fit.noise, fit.track
+                key = fit.noise.structure, fit.hypothesis.spread, tuple(sorted(start[0].names))
+                if key not in self.fits or self.score(self.fits[key]) < self.score(fit):
+                    self.refined([start], TO_THE_TOP)
 
     def far(self, fit: Fitted) -> bool:
         """Check whether a parameter has moved by more than its prior standard deviation."""

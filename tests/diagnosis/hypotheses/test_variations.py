@@ -92,7 +92,7 @@ def test_a_delay_of_each_input_replaces_one_of_all_and_more_of_some(search, more
     both, limit = ("delay:a+b", {"d": 0.04}), (LIMIT, {"r": RATE})
     found = names_of(search, both, (later, {name: 0.01}), limit)
     assert (DELAY, "delay:b", LIMIT) in found
-    assert names_of(search, both) == [(DELAY, "delay:b")]
+    assert (DELAY, "delay:b") in names_of(search, both)
 
 
 def test_a_command_that_is_later_than_another_gets_a_delay_of_its_own(fine=10, count=400):
