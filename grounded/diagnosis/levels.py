@@ -8,7 +8,7 @@ from __future__ import annotations
 
 # evidence [nats]
 NATS = 3.0  # from which one explanation is preferred; within it two tie ("Decide")
-PICKED = 5.0  # of what was picked among many: a cause, a leftover, a changed value ("Decide")
+PICKED = 8.0  # of what was picked among many: a cause, a leftover, a changed value ("Decide")
 
 # standard errors, and chance
 ERRORS = 0.9  # by which one prediction is better than another ("Decide")

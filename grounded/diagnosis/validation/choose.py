@@ -14,10 +14,11 @@ where its values were not fitted (`ruler`, by group of trials). The rule has fou
        (Piironen & Vehtari 2017).
        A set that predicts worse than the model without effects, calibrated or not, is claimed with
        calibrated parameters, or not at all if that predicts worse, too.
-    4. Of those that are as small, the likeliest. Within NATS nats they tie: then a parameter comes
-       before a mechanism, and that before what has no mechanism, what acts on one input before
-       what acts on several (`Option.order`). A supported set that is no larger replaces the
-       choice if it predicts better and is likelier by NATS.
+    4. Of those that are as small, the likeliest, a calibrated one with PICKED nats more: what all
+       parameters explain, each a little off, one more effect can imitate. Within NATS nats they
+       tie: then a parameter comes before a mechanism, and that before what has no mechanism, what
+       acts on one input before what acts on several (`Option.order`). A supported set that is no
+       larger replaces the choice if it predicts better and is likelier by PICKED.
 
 A cause is an effect, or the calibration of the model's own parameters. `benchmarks/decide.py` draws
 each number's curve.
@@ -120,18 +121,22 @@ class Rule:
         claims = [(option, claim) for option in near if (claim := self._claimed(option))]
         least = min(len(option.causes) for option, _ in claims)
         small = [pair for pair in claims if len(pair[0].causes) == least]
-        nats = {option.causes: self.nats(none, option) for option, _ in small}
+        nats = {option.causes: self._evidence(none, option) for option, _ in small}
         tied = [pair for pair in small if nats[pair[0].causes] > max(nats.values()) - NATS]
         _, chosen = min(tied, key=lambda pair: (pair[0].order, -nats[pair[0].causes]))
         chosen = self._surpassed(chosen)
         apart = self.gain(chosen.errors, reference.errors)
         return Choice(chosen, reference, apart.mean, apart.paired[1])
 
+    def _evidence(self, none: Option, option: Option) -> float:
+        """Return how likely a set is in a tie: one more effect in place of calibration less."""
+        return self.nats(none, option) + PICKED * (CALIBRATION in option.causes)
+
     def _surpassed(self, chosen: Option) -> Option:
         """Return the likeliest supported set, no larger, that predicts better and is likelier."""
         least = self.gained(chosen)
         small = [o for o in self.options if o.size <= chosen.size and self.gained(o) > least]
-        likelier = [o for o in small if self.nats(chosen, o) > NATS and self.supported(o)]
+        likelier = [o for o in small if self.nats(chosen, o) > PICKED and self.supported(o)]
         if not likelier:
             return chosen
         return self._surpassed(max(likelier, key=lambda option: self.nats(chosen, option)))
