@@ -107,18 +107,22 @@ class System(ABC):
         return np.asarray(np.abs(np.concatenate(slopes, axis=2)).max(axis=0) > FLAT)
 
     def fault(self, x: Array, u: Array, p: Array, dt: float) -> str:
-        """Where a step from x (n,), u (m,) makes a number that is not finite; or ""."""
+        """Where a step from x (n,), u (m,) makes a number that is not finite; or "".
+
+        The user's function is asked first: a rate that is NaN makes other states NaN, too.
+        """
         at, sent, known = ([np.float64(value) for value in some] for some in (x, u, p))
-        try:
-            with np.errstate(all="raise", under="ignore"):
-                whole = self.signature.whole(self.integrator)
-                after = whole.call(at, sent, known, np.float64(dt))
-        except (ArithmeticError, ValueError) as error:
-            kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
-            return f"{raised_at(error, self.signature.function)}: {kind}{error}"
-        found = {name: float(after[name]) for name in self.states}
-        bad = (f"{found[name]:g} for '{name}'" for name in found if not np.isfinite(found[name]))
-        return f"{self.source}: {said}" if (said := next(bad, "")) else ""
+        for function in (self.signature, self.signature.whole(self.integrator)):
+            try:
+                with np.errstate(all="raise", under="ignore"):
+                    after = function.call(at, sent, known, np.float64(dt))
+            except (ArithmeticError, ValueError) as error:
+                kind = "" if isinstance(error, FloatingPointError) else f"{type(error).__name__}: "
+                return f"{raised_at(error, self.signature.function)}: {kind}{error}"
+            for name in self.states:
+                if not np.isfinite(float(after[name])):
+                    return f"{self.source}: {float(after[name]):g} for '{name}'"
+        return ""
 
     def inverse(self, x: Array, after: Array, p: Array, dt: float) -> Array | None:
         """Inputs (N, m) that lead from x (N, n) to about `after` (N, n); None where unknown."""

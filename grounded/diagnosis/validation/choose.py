@@ -11,7 +11,8 @@ where its values were not fitted (`ruler`, by group of trials). The rule has fou
     2. The *reference* is the supported set that predicts best.
     3. Of the supported sets that the reference is not better than, the smallest is chosen: the
        one-standard-error rule of Breiman et al. (1984), and of projection predictive selection
-       (Piironen & Vehtari 2017).
+       (Piironen & Vehtari 2017). If the reference predicts clearly better, and by SHOWS, evidence
+       must not contradict it by PICKED, but need not be for it.
        A set that predicts worse than the model without effects, calibrated or not, is claimed with
        calibrated parameters, or not at all if that predicts worse, too.
     4. Of those that are as small, the likeliest, a calibrated one with PICKED nats more: what all
@@ -117,7 +118,7 @@ class Rule:
             return Choice(likeliest, likeliest, 0.0, 0.0)
         by = sorted(self.options, key=self.gained, reverse=True)
         reference = next(option for option in by if self.supported(option))
-        near = [o for o in by if not self.better(o, reference) and self.supported(o)]
+        near = [o for o in by if not self._outdone(o, reference) and self.supported(o)]
         claims = [(option, claim) for option in near if (claim := self._claimed(option))]
         least = min(len(option.causes) for option, _ in claims)
         small = [pair for pair in claims if len(pair[0].causes) == least]
@@ -127,6 +128,12 @@ class Rule:
         chosen = self._surpassed(chosen)
         apart = self.gain(chosen.errors, reference.errors)
         return Choice(chosen, reference, apart.mean, apart.paired[1])
+
+    def _outdone(self, option: Option, reference: Option) -> bool:
+        """Check whether the reference is better than a set, or clearly predicts better."""
+        gain = self.gain(option.errors, reference.errors)
+        shows = gain.clear and gain.mean > SHOWS and self.nats(option, reference) > -PICKED
+        return shows or self.better(option, reference)
 
     def _evidence(self, none: Option, option: Option) -> float:
         """Return how likely a set is in a tie: one more effect in place of calibration less."""

@@ -46,7 +46,8 @@ import sys
 passed = set()
 def see(frame, event, arg):
     code = frame.f_code
-    if event == "call" and "grounded" in code.co_filename and code.co_name != "<module>":
+    ours = frame.f_globals.get("__name__", "").startswith("grounded")
+    if event == "call" and ours and code.co_name != "<module>":
         passed.add((code.co_filename, code.co_qualname, code.co_firstlineno))
 sys.setprofile(see)
 from grounded_trials import Workspace
