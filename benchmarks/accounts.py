@@ -591,6 +591,16 @@ def run_of(
     )
 
 
+def searched(task: Task, real: Real, rng: np.random.Generator) -> Search:
+    """Return a search after its first trials on a robot."""
+    search = Search(task)
+    for _ in range(TRIALS):
+        if (one := search.ask()) is None:
+            break
+        search.tell(run_of(real, one, rng, one.id))
+    return search
+
+
 def runs(
     robot: Robot, rng: np.random.Generator, wrong: int, hand: int
 ) -> Iterator[tuple[str, str]]:
@@ -605,11 +615,7 @@ def runs(
     from grounded.accounts.returned import suspicion
 
     task, real = task_of(robot, rng), Real.drawn(robot, rng)
-    search = Search(task)
-    for _ in range(TRIALS):
-        if (one := search.ask()) is None:
-            break
-        search.tell(run_of(real, one, rng, one.id))
+    search = searched(task, real, rng)
     some = {one.id: one for one in search.candidates}
 
     def told(trial: Trial, ran: str = "") -> str:
@@ -645,11 +651,7 @@ def ingested(which: str, seed: int, count: int) -> Iterator[tuple[str, str]]:
     """
     robot, rng = ROBOTS[which](), np.random.default_rng([seed, 33, [*ROBOTS].index(which)])
     task, real = task_of(robot, rng), Real.drawn(robot, rng)
-    search = Search(task)
-    for _ in range(TRIALS):
-        if (one := search.ask()) is None:
-            break
-        search.tell(run_of(real, one, rng, one.id))
+    search = searched(task, real, rng)
     with TemporaryDirectory() as name:
         here = workspace_of(Path(name), which, task)
         some = [here.save_candidate(one) for one in search.candidates]

@@ -155,7 +155,7 @@ def grown(search: HypothesisSearch, best: Fitted, most: int) -> Fitted:
         for start in (best, *near, *(search.exact(best) if calibrates else ())):
             search.extended(start, SOME)
         size += 1
-        for exact in (False, True)[: 1 + calibrates]:
+        for exact in (False, True) if calibrates else (False,):
             search.refined(search.of_size(size, exact=exact)[:HOPEFUL], 10)
             search.refined(search.of_size(size, exact=exact)[:TOP], TO_THE_TOP)
             search.shrunk(search.of_size(size, exact=exact)[:TOP])

@@ -136,7 +136,7 @@ class Rule:
         return shows or self.better(option, reference)
 
     def _evidence(self, none: Option, option: Option) -> float:
-        """Return how likely a set is in a tie: one more effect in place of calibration less."""
+        """Return how likely a set is where calibration competes with one more effect [nats]."""
         return self.nats(none, option) + PICKED * (CALIBRATION in option.causes)
 
     def _surpassed(self, chosen: Option) -> Option:
