@@ -351,8 +351,9 @@ def _compared(
     if (size > (abs(np.log(account.factor)) / 3 if unit else np.log(FACTOR))).any():
         return None  # the inputs act otherwise than in the model
     after = mended.best([ones], free=False) if unit else free
-    if unit:
-        before = logged.best([ones], free=False)
+    if unit:  # a factor that takes an input away is no unit
+        dead = np.where(np.isin(np.arange(model.m), sent), 0.0, ones)
+        before = logged.best([ones, dead], free=False)
     else:
         before = logged.best([ones, -ones, 0.0 * ones, *(ones - 2 * np.eye(model.m))])
     better = before.missed - after.missed > MARGIN + account.price
